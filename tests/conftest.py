@@ -1,0 +1,29 @@
+"""Every test runs on one Mitsuba variant, chosen with ``--variant`` (default ``llvm_ad_rgb``)."""
+
+import os
+from pathlib import Path
+
+# BLAS threads and Dr.Jit's thread pool fight for the same cores.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import mitsuba as mi
+import pytest
+
+
+def pytest_addoption(parser):
+    parser.addoption("--variant", default="llvm_ad_rgb", help="Mitsuba variant to test on")
+
+
+def pytest_configure(config):
+    mi.set_variant(config.getoption("--variant"))
+
+
+@pytest.fixture(scope="session")
+def variant(request) -> str:
+    return request.config.getoption("--variant")
+
+
+@pytest.fixture(scope="session")
+def scenes_dir() -> Path:
+    """The scenes folder of this repository."""
+    return Path(__file__).parents[1] / "scenes"
