@@ -1,0 +1,161 @@
+"""The extracted mesh, and how its vertices hang on the lattice."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import trimesh
+
+from ..errors import UserError
+
+
+@dataclass(frozen=True)
+class EdgePoints:
+    """Points on lattice edges: the point ``(1 - t) a + t b`` of the edge from vertex ``a`` to ``b``."""
+
+    a: Any  # UInt32, vertex ids
+    b: Any  # UInt32
+    t: Any  # Float in (0, 1), attached to the signed distance field
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.a)
+
+    def apply(self, fetch: Callable[[Any], Any]) -> Any:
+        return _lerp(fetch(self.a), fetch(self.b), self.t)
+
+    def interpolate(self, field: Any) -> Any:
+        return self.apply(lambda vertex: dr.gather(type(field), field, vertex))
+
+    def at(self, index: Any) -> "EdgePoints":
+        a, b = (dr.gather(type(index), x, index) for x in (self.a, self.b))
+        return EdgePoints(a, b, dr.gather(type(self.t), self.t, index))
+
+
+@dataclass(frozen=True)
+class CutPoints:
+    """Points on the segment between two edge points: ``(1 - t) start + t end``."""
+
+    start: EdgePoints
+    end: EdgePoints
+    t: Any  # Float in (0, 1), attached to both fields
+
+    @property
+    def count(self) -> int:
+        return self.start.count
+
+    def apply(self, fetch: Callable[[Any], Any]) -> Any:
+        return _lerp(self.start.apply(fetch), self.end.apply(fetch), self.t)
+
+
+@dataclass(frozen=True)
+class Stencil:
+    """How mesh vertices interpolate the lattice: blocks of points, one after the other."""
+
+    blocks: tuple[EdgePoints | CutPoints, ...]
+
+    @property
+    def count(self) -> int:
+        return sum(block.count for block in self.blocks)
+
+    def apply(self, fetch: Callable[[Any], Any]) -> Any:
+        """The values at the mesh vertices of what ``fetch`` returns for lattice vertex ids."""
+        return concatenate([block.apply(fetch) for block in self.blocks])
+
+
+@dataclass(frozen=True)
+class SurfaceMesh:
+    """A triangle mesh extracted from lattice fields, differentiable in them.
+
+    The faces are oriented: anticlockwise seen from outside the template. Every vertex and every face is
+    used once; the mesh is an edge- and vertex-manifold whose boundary vertices have two boundary edges.
+    """
+
+    vertices: Any
+    """Positions, Dr.Jit ``Array3f``, in lattice units ([-1, 1]^3)."""
+    faces: Any
+    """Vertex indices, Dr.Jit ``Array3u``."""
+    msdf: Any
+    """mSDF at the vertices, ``Float``: >= 0 on an open surface, 0 where it was cut."""
+    lattice_vertex_count: int
+    """Values that a field given to ``interpolate`` must have."""
+    stencil: Stencil | None
+    """Weights of the vertices on the lattice; None if the mesh is empty."""
+    template: "SurfaceMesh | None" = None
+    """The watertight surface that this one was cut from, if it was asked for. Its first
+    ``kept_vertex_count`` vertices are the first ones of this mesh."""
+    kept_vertex_count: int = 0
+    """Vertices of the template that stay; the vertices after them lie on the cut."""
+
+    @property
+    def vertex_count(self) -> int:
+        return dr.width(self.vertices)
+
+    @property
+    def face_count(self) -> int:
+        return dr.width(self.faces)
+
+    @property
+    def is_empty(self) -> bool:
+        return self.face_count == 0
+
+    def interpolate(self, field: Any) -> Any:
+        """Interpolates any lattice field at the vertices with the weights that made their positions.
+
+        Args:
+            field: one value per lattice vertex: ``Float`` or ``ArrayNf`` (N channels).
+
+        Returns:
+            The same type, one value per mesh vertex; differentiable in ``field`` and in ``sdf`` and
+            ``msdf`` through the weights.
+
+        Raises:
+            UserError: the field has another number of values than the lattice has vertices.
+        """
+        if dr.width(field) != self.lattice_vertex_count:
+            raise UserError(
+                f"a field to interpolate has {dr.width(field)} values, but the lattice has "
+                f"{self.lattice_vertex_count} vertices"
+            )
+        if self.stencil is None:
+            return dr.zeros(type(field), 0)
+        return self.stencil.apply(lambda vertex: dr.gather(type(field), field, vertex))
+
+    def to_numpy(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices (V, 3) float32, faces (F, 3) int64 and mSDF (V,) float32 on the host."""
+        if self.is_empty:
+            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64), np.zeros(0, np.float32)
+        detached = dr.detach((self.vertices, self.msdf))
+        return (
+            np.array(detached[0].numpy().T, order="C"),
+            np.array(self.faces.numpy().T, np.int64, order="C"),
+            detached[1].numpy(),
+        )
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """A detached copy for trimesh, with ``msdf`` among its vertex attributes."""
+        vertices, faces, msdf = self.to_numpy()
+        return trimesh.Trimesh(vertices, faces, vertex_attributes={"msdf": msdf}, process=False)
+
+
+def _lerp(start: Any, end: Any, t: Any) -> Any:
+    # Not start + t (end - start), whose difference may overflow.
+    return (1 - t) * start + t * end
+
+
+def concatenate(values: list) -> Any:
+    """``dr.concat`` for Dr.Jit arrays of changing sizes: no size ends up in a kernel's code."""
+    if len(values) == 1:
+        return values[0]
+    total = sum(dr.width(v) for v in values)
+    kind = type(values[0])
+    uint32_t = dr.uint32_array_t(dr.leaf_t(kind))
+    result = dr.empty(kind, total)
+    offset = 0
+    for value in values:
+        index = dr.arange(uint32_t, dr.width(value)) + dr.opaque(uint32_t, offset)
+        dr.scatter(result, value, index, mode=dr.ReduceMode.Permute)
+        offset += dr.width(value)
+    return result

@@ -1,0 +1,112 @@
+"""The lattice on which the fields live: a cube of cells, each split into six Kuhn tetrahedra."""
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from .errors import UserError
+
+#: Offset of a lattice vertex, in cells and along each axis, that ``deform = 1`` stands for.
+#:
+#: The signed volume of a Kuhn tetrahedron is linear in every single vertex coordinate, so its minimum
+#: over all offsets in [-c, c]^12 is taken at a corner of that box; over the 4096 corners the smallest c
+#: at which it reaches 0 is 1/6 (where it is 1 - 6c: the four vertices move by +c, -c, +c, -c along each
+#: axis, up to signs). Half the shortest edge, 1/2, would not do. Below 1/6 no tetrahedron inverts
+#: whatever the offsets are, hence the lattice stays embedded and no surface in it intersects itself; at
+#: 0.15 the flattest tetrahedron keeps a tenth of its volume, which also keeps triangles from degenerating.
+MAX_OFFSET_CELLS = 0.15
+
+
+@dataclass(frozen=True)
+class TetLattice:
+    """Kuhn tetrahedra on [-1, 1]^3 with ``resolution`` cells per side.
+
+    Vertex ``(x, y, z)`` with 0 <= x, y, z <= resolution has the id ``x + y S + z S^2``,
+    ``S = resolution + 1``: a flat field reshaped in NumPy's (C) order to ``(S, S, S)`` is indexed
+    ``[z, y, x]``. All lengths are in lattice units, in which the cube has the side 2.
+
+    Each cell is split along the diagonal from its lowest to its highest corner (Kuhn 1960; Freudenthal
+    1942). The split is the same in every cell, so neighbours share their faces, and every edge and every
+    face of the lattice is its lowest vertex plus one of 7 edge or 12 face types (``extraction.tables``).
+
+    >>> lattice = TetLattice(2)
+    >>> lattice.vertex_count, lattice.spacing
+    (27, 1.0)
+    >>> lattice.vertex_positions()[5]
+    array([ 1.,  0., -1.], dtype=float32)
+    """
+
+    resolution: int
+
+    def __post_init__(self):
+        if not 1 <= self.resolution <= 800:
+            raise UserError(
+                f"lattice resolution must be between 1 and 800 cells per side, not {self.resolution}"
+            )
+
+    @property
+    def stride(self) -> int:
+        """Vertices per side, ``resolution + 1``."""
+        return self.resolution + 1
+
+    @property
+    def vertex_count(self) -> int:
+        return self.stride**3
+
+    @property
+    def spacing(self) -> float:
+        """Side of a cell, in lattice units."""
+        return 2.0 / self.resolution
+
+    @property
+    def max_offset(self) -> float:
+        """Greatest offset of a vertex along an axis, in lattice units: that of ``deform = 1``."""
+        return MAX_OFFSET_CELLS * self.spacing
+
+    def vertex_positions(self) -> np.ndarray:
+        """Positions of all vertices without offsets, ``(vertex_count, 3)`` float32 on the host."""
+        axis = np.linspace(-1.0, 1.0, self.stride, dtype=np.float32)
+        z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+        return np.stack([x, y, z], axis=-1).reshape(-1, 3)
+
+    def points(self, float_t: type) -> Any:
+        """The same positions as a Dr.Jit ``Array3f``, for fields evaluated on the device.
+
+        Args:
+            float_t: the Dr.Jit float type to compute with, e.g. ``drjit.llvm.ad.Float`` or ``mi.Float``.
+
+        >>> import drjit.llvm.ad as d
+        >>> sphere = dr.norm(TetLattice(8).points(d.Float)) - 0.5
+        >>> dr.width(sphere)
+        729
+        """
+        return self.positions_of(dr.arange(dr.uint32_array_t(float_t), self.vertex_count), float_t)
+
+    def positions_of(self, vertex: Any, float_t: type) -> Any:
+        """Positions of the vertices with the ids ``vertex``, without offsets, as ``Array3f``."""
+        uint32_t = dr.uint32_array_t(float_t)
+        stride = dr.opaque(uint32_t, self.stride)
+        row = vertex // stride
+        z = row // stride
+        cell = dr.opaque(float_t, self.spacing)
+        array3f_t = array_type(float_t, "Array3f")
+        return array3f_t(
+            dr.fma(float_t(vertex - row * stride), cell, -1),
+            dr.fma(float_t(row - z * stride), cell, -1),
+            dr.fma(float_t(z), cell, -1),
+        )
+
+
+def array_type(float_t: type, name: str) -> type:
+    """The Dr.Jit type ``name`` (``"Array3f"``, ``"Array3u"``) of the backend that ``float_t`` belongs to.
+
+    >>> import drjit.llvm.ad as d
+    >>> array_type(d.Float, "Array3u") is d.Array3u
+    True
+    """
+    import importlib
+
+    return getattr(importlib.import_module(float_t.__module__), name)
