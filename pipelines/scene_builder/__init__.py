@@ -1,0 +1,1 @@
+"""Builders of the scenes under ``scenes/``: modelling, draping, lights, files."""

@@ -1,0 +1,1 @@
+"""One module per object; each has ``build() -> SceneObject``."""
