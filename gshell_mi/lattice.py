@@ -107,6 +107,4 @@ def array_type(float_t: type, name: str) -> type:
     >>> array_type(d.Float, "Array3u") is d.Array3u
     True
     """
-    import importlib
-
     return getattr(importlib.import_module(float_t.__module__), name)

@@ -9,6 +9,7 @@ corner, a simplex is known by the differences to it:
 * a tetrahedron is a chain ``0 < a < b < 7``, ``TETS`` (6 of them).
 """
 
+from functools import cache
 from itertools import permutations
 
 import numpy as np
@@ -102,6 +103,7 @@ def _pack(values: list[int], bits: int) -> int:
     return sum(v << bits * i for i, v in enumerate(values))
 
 
+@cache
 def _cell_polygons() -> list[list[list[Edge]]]:
     """``tet_polygon`` for every tetrahedron and every combination of inside corners of its cell."""
     return [
@@ -110,6 +112,7 @@ def _cell_polygons() -> list[list[list[Edge]]]:
     ]
 
 
+@cache
 def active_tets_table() -> np.ndarray:
     """``[signs]``: bit i tells that the surface passes through tetrahedron i; ``signs`` has bit c set if
     corner c of the cell is inside."""
@@ -117,6 +120,7 @@ def active_tets_table() -> np.ndarray:
     return np.array([_pack([bool(p[signs]) for p in polygons], 1) for signs in range(256)], np.uint32)
 
 
+@cache
 def polygon_table() -> np.ndarray:
     """``[tet * 256 + signs]``: four edges of 6 bits (corner << 3 | difference); bit 24: it is a quad."""
     return np.array(
@@ -129,6 +133,7 @@ def polygon_table() -> np.ndarray:
     )
 
 
+@cache
 def side_table() -> np.ndarray:
     """``[tet * 256 + signs]``: faces that hold the polygon's sides, 7 bits each (corner << 4 | type)."""
     return np.array(
@@ -141,6 +146,7 @@ def side_table() -> np.ndarray:
     )
 
 
+@cache
 def clip_table() -> np.ndarray:
     """``[quad * 16 + kept]``: up to three triangles of three 3-bit local indices; bits 27-28: how many."""
     table = np.zeros(2 * 16, np.uint32)

@@ -385,11 +385,9 @@ class _Extraction:
             msdf = dr.full(self.float_t, 1, stencil.count)
         else:
             # The cut lies at 0, which interpolation gives but for rounding.
-            values = [
-                block.interpolate(msdf) if isinstance(block, EdgePoints) else dr.zeros(self.float_t, block.count)
-                for block in blocks
-            ]
-            msdf = concatenate(values)
+            zeros = [dr.zeros(self.float_t, block.count) for block in blocks if isinstance(block, CutPoints)]
+            edges = [block.interpolate(msdf) for block in blocks if isinstance(block, EdgePoints)]
+            msdf = concatenate(edges + zeros)
         dr.eval(vertices, msdf, [block.t for block in blocks])
         return SurfaceMesh(
             vertices, faces, msdf, self.lattice.vertex_count, stencil, kept_vertex_count=kept_count
