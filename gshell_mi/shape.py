@@ -1,0 +1,1 @@
+"""The ``gshell`` shape plugin."""
