@@ -1,11 +1,240 @@
 """The reparameterised path integrator ``gshell_path``."""
 
+from dataclasses import dataclass
+
+import drjit as dr
 import mitsuba as mi
-from mitsuba.python.ad.integrators.prb import PRBIntegrator
+from mitsuba.python.ad.integrators.common import ADIntegrator
+
+from . import reparameterised_film
+from .path_vertex import material_point, mis_weight, sample_direct, segment
 
 
-class GShellPathIntegrator(PRBIntegrator):
-    """Path integrator; derivatives of visibility are not yet included."""
+@dataclass
+class PathSample:
+    """What one camera ray returns."""
+
+    value: object   #: ``Spectrum``: radiance
+    alpha: object   #: ``Float``: coverage
+    aovs: object    #: list of ``Float``
+
+
+class GShellPathIntegrator(ADIntegrator):
+    """Path integrator with derivatives of visibility, by a warp of the film."""
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.hide_emitters = props.get("hide_emitters", False)
+        self.warp_radius = props.get("warp_radius", 2.0)
+        self.cull_hidden = props.get("cull_hidden", True)
+
+    # ------------------------------------------------------------------ rendering
+
+    def sample(self, mode, scene, sampler, ray, active=True, **kwargs):
+        result = self.primal(scene, sampler, mi.Ray3f(ray), active)
+        return result.value, result.alpha > 0.5, result.aovs, None
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        return reparameterised_film.render_forward(self, scene, sensor, seed, spp)
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        reparameterised_film.render_backward(self, scene, grad_in, sensor, seed, spp)
+
+    # ------------------------------------------------------------------ paths
+
+    def _first_hit(self, scene, ray, active=True):
+        """The first intersection, behind the area lights if emitters are hidden."""
+        pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        if self.hide_emitters and _has_surface_emitters(scene):
+            skip = pi.is_valid() & (pi.shape.emitter() != None) & active  # noqa: E711
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip)
+            pi[skip] = self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, skip)
+        return pi
+
+    @dr.syntax
+    def primal(self, scene, sampler, ray, active=True):
+        """Radiance and coverage along camera rays, without derivatives."""
+        ray = mi.Ray3f(dr.detach(ray))
+        depth = mi.UInt32(0)
+        L, beta, eta = mi.Spectrum(0), mi.Spectrum(1), mi.Float(1)
+        active = mi.Bool(active)
+        covered = mi.Bool(not self.hide_emitters and scene.environment() is not None)
+        pi = self._first_hit(scene, ray, active)
+        si_prev = dr.zeros(mi.SurfaceInteraction3f)
+        pdf_prev, delta_prev = mi.Float(1), mi.Bool(True)
+
+        while dr.hint(active, max_iterations=self.max_depth, label="gshell_path (primal)"):
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+            bsdf = si.bsdf(ray)
+            L += beta * self._emission(scene, si, si_prev, pdf_prev, delta_prev, depth, active)
+            active_next = active & (depth + 1 < self.max_depth) & si.is_valid()
+            L += beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, False, False)
+            sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(),
+                                         active_next)
+            covered |= active & si.is_valid() & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
+            ray = si.spawn_ray(si.to_world(sample.wo))
+            beta *= weight
+            eta *= sample.eta
+            si_prev = si
+            pdf_prev, delta_prev = sample.pdf, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+            beta, active_next = self._roulette(beta, eta, depth, sampler, active_next)
+            pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active_next)
+            depth[si.is_valid()] += 1
+            active = active_next
+
+        return PathSample(L, dr.select(covered, mi.Float(1), mi.Float(0)), [])
+
+    def _emission(self, scene, si, si_prev, pdf_prev, delta_prev, depth, active):
+        """Light emitted at a vertex towards the one before, weighted against emitter sampling."""
+        if self.hide_emitters:
+            active = active & ~((depth == 0) & ~si.is_valid())
+        ds = mi.DirectionSample3f(scene, si=dr.detach(si), ref=si_prev)
+        emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, ~delta_prev)
+        return mis_weight(pdf_prev, emitter_pdf) * ds.emitter.eval(si, active)
+
+    def _roulette(self, beta, eta, depth, sampler, active):
+        peak = dr.max(mi.unpolarized_spectrum(beta))
+        survive = dr.minimum(peak * dr.square(eta), 0.95)
+        play = depth >= self.rr_depth
+        go_on = sampler.next_1d() < survive
+        beta = dr.select(play, beta * dr.rcp(survive), beta)
+        return beta, active & (peak != 0) & (~play | go_on)
+
+    def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
+        """Derivatives of camera paths.
+
+        ``ray`` is attached to the film warp and the sensor. In reverse mode returns a ``Float`` whose
+        derivative is that of the adjoint-weighted samples; in forward mode the channels' tangents and
+        those of ``film_terms``.
+        """
+        surface_emitters = _has_surface_emitters(scene)
+        ray_now = dr.detach(ray)
+        with dr.suspend_grad():
+            pi = self._first_hit(scene, ray_now)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        si_now = dr.detach(si)
+        bsdf = si.bsdf(mi.RayDifferential3f(ray_now))
+        active = mi.Bool(True)
+        depth = mi.UInt32(0)
+        first = dr.zeros(mi.SurfaceInteraction3f)
+        emitted = self._emission(scene, si, first, mi.Float(1), mi.Bool(True), depth, active)
+        active_next = active & (depth + 1 < self.max_depth) & si.is_valid()
+        direct = sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, True, surface_emitters)
+        with dr.suspend_grad():
+            sample, weight = bsdf.sample(mi.BSDFContext(), si_now, sampler.next_1d(), sampler.next_2d(),
+                                         active_next)
+            ray_next = si_now.spawn_ray(si_now.to_world(sample.wo))
+            delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+            beta, active_next = self._roulette(mi.Spectrum(weight), sample.eta, depth, sampler, active_next)
+            rest = state.value - dr.detach(emitted) - dr.detach(direct)
+            pi_next = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active_next)
+        p_next, area_next = material_point(pi_next, ray_next, active_next)
+        d, solid_angle = segment(si.p, p_next, area_next, active_next & pi_next.is_valid(), ray_next.d)
+        value = bsdf.eval(mi.BSDFContext(), si, si.to_local(d), active_next)
+        indirect = rest * dr.relative_grad(value) * solid_angle
+        radiance = emitted + direct + dr.select(active_next, indirect, 0)
+
+        tail = (scene, sampler, ray_next, pi_next, si_now, rest, beta, sample.eta, sample.pdf, delta,
+                active_next)
+        deeper = self.max_depth > 2
+        if mode == dr.ADMode.Backward:
+            total = on_sample(radiance, state.alpha, state.aovs)
+            if deeper:
+                with dr.suspend_grad():
+                    adjoint = _adjoint_of_value(on_sample, state)
+                    on_p = self._replay(mode, *tail, adjoint, mi.Vector3f(0))
+                total += dr.dot(si.p, on_p)
+            return total
+        dr.forward_to(radiance, si.p, *film_terms)
+        tangent, p_tangent = dr.grad(radiance), mi.Vector3f(dr.grad(si.p))
+        film_tangents = [dr.grad(x) for x in film_terms]
+        if deeper:
+            with dr.suspend_grad():
+                tangent += self._replay(mode, *tail, mi.Spectrum(0), p_tangent)
+        return on_sample(tangent, mi.Float(0), []), film_tangents
+
+    @dr.syntax
+    def _replay(self, mode, scene, sampler, ray, pi, si_prev, L, beta, eta, pdf_prev, delta_prev, active,
+                adjoint, p_tangent):
+        """Path replay (Vicini et al. 2021) from the second vertex on.
+
+        Reverse mode takes the adjoint of the radiance and returns that of the first vertex's
+        position; forward mode takes the tangent of that position and returns the radiance's.
+        """
+        surface_emitters = _has_surface_emitters(scene)
+        backward = mode == dr.ADMode.Backward
+        depth = mi.UInt32(1)
+        tangent = mi.Spectrum(0)
+        on_first = mi.Vector3f(0)
+        first_p = mi.Point3f(si_prev.p)
+        pi_prev, ray_prev = dr.zeros(mi.PreliminaryIntersection3f, dr.width(pi)), mi.Ray3f(ray)
+        active = mi.Bool(active)
+
+        while dr.hint(active, max_iterations=self.max_depth - 1, label="gshell_path (replay)"):
+            second = depth == 1
+            with dr.resume_grad():
+                p_first = mi.Point3f(first_p)
+                dr.enable_grad(p_first)
+                if dr.hint(not backward, mode="scalar"):
+                    dr.set_grad(p_first, p_tangent)
+                p_prev = pi_prev.compute_surface_interaction(
+                    ray_prev, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, active & ~second).p
+                p_prev = dr.select(second, p_first, p_prev)
+                si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+                wi = si.to_local(dr.normalize(p_prev - si.p))
+                si.wi = dr.replace_grad(si.wi, dr.select(si.is_valid(), wi, si.wi))
+                emitted = beta * self._emission(scene, si, si_prev, pdf_prev, delta_prev, depth, active)
+            si_now = dr.detach(si)
+            bsdf = si_now.bsdf(mi.RayDifferential3f(ray))
+            active_next = active & (depth + 1 < self.max_depth) & si_now.is_valid()
+            with dr.resume_grad():
+                direct = beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, True,
+                                              surface_emitters)
+            sample, weight = bsdf.sample(mi.BSDFContext(), si_now, sampler.next_1d(), sampler.next_2d(),
+                                         active_next)
+            L -= dr.detach(emitted) + dr.detach(direct)
+            ray_next = si_now.spawn_ray(si_now.to_world(sample.wo))
+            beta *= weight
+            eta *= sample.eta
+            beta, active_next = self._roulette(beta, eta, depth, sampler, active_next)
+            pi_next = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active_next)
+            with dr.resume_grad():
+                p_next, area_next = material_point(pi_next, ray_next, active_next)
+                d, solid_angle = segment(si.p, p_next, area_next, active_next & pi_next.is_valid(),
+                                         ray_next.d)
+                value = bsdf.eval(mi.BSDFContext(), si, si.to_local(d), active_next)
+                indirect = dr.select(active_next, L * dr.relative_grad(value) * solid_angle, 0)
+                radiance = emitted + direct + indirect
+                if dr.hint(backward, mode="scalar"):
+                    dr.backward_from(adjoint * radiance)
+                    on_first += dr.select(active & second, mi.Vector3f(dr.grad(p_first)), 0)
+                else:
+                    tangent += dr.forward_to(radiance)
+            si_prev = si_now
+            pdf_prev, delta_prev = sample.pdf, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+            depth[si_now.is_valid()] += 1
+            pi_prev, pi = pi, pi_next
+            ray_prev, ray = ray, ray_next
+            active = active_next
+
+        return on_first if backward else tangent
+
+    def to_string(self):
+        return (f"GShellPathIntegrator[max_depth={self.max_depth}, rr_depth={self.rr_depth}, "
+                f"hide_emitters={self.hide_emitters}, warp_radius={self.warp_radius}]")
+
+
+def _has_surface_emitters(scene):
+    return any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in scene.emitters())
+
+
+def _adjoint_of_value(on_sample, state):
+    """Adjoint of the radiance of each sample (``on_sample`` is linear in it)."""
+    with dr.resume_grad():
+        value = mi.Spectrum(state.value)
+        dr.enable_grad(value)
+        dr.backward_from(on_sample(value, dr.detach(state.alpha), dr.detach(state.aovs)))
+        return dr.grad(value)
 
 
 mi.register_integrator("gshell_path", lambda props: GShellPathIntegrator(props))

@@ -1,0 +1,132 @@
+"""Unique edges of a triangle soup, found on the device by hashing.
+
+The meshes of a fit change their connectivity in every iteration, so adjacency has to cost
+milliseconds and must not compile kernels anew. A hash table with open addressing, filled by
+compare-and-swap, does both; no sort is needed.
+"""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+_EMPTY = 0xFFFFFFFF
+
+
+@dr.syntax
+def first_with_equal_key(keys, active):
+    """For each entry the index of one entry, the same for all, that has an equal key.
+
+    Parameters
+    ----------
+    keys:
+        List of ``UInt32`` arrays of one width ``n``: the words of the keys.
+    active:
+        ``Bool``, width ``n``: entries that take part. Others get ``0xFFFFFFFF``.
+
+    Returns
+    -------
+    ``UInt32``, width ``n``. Which of several equal entries represents them depends on the order in
+    which threads run.
+
+    >>> key = mi.UInt32(7, 5, 7, 9)
+    >>> r = first_with_equal_key([key], mi.Bool(True, True, True, False))
+    >>> bool(r[0] == r[2] and r[0] in (0, 2)), r[1], r[3] == 0xFFFFFFFF
+    (True, 1, True)
+    """
+    n = dr.width(keys[0])
+    active = mi.Bool(active)
+    size = 1 << max(4, (2 * n - 1).bit_length())
+    table = dr.full(mi.UInt32, _EMPTY, size)
+    mask = dr.opaque(mi.UInt32, size - 1)
+    dr.eval(keys, active, table)
+
+    h = mi.UInt32(0x9E3779B9)
+    for word in keys:
+        h = (h ^ word) * 0x85EBCA6B
+        h ^= h >> 15
+    h *= 0xC2B2AE35
+    h ^= h >> 13
+
+    index = dr.arange(mi.UInt32, n)
+    slot = h & mask
+    result = mi.UInt32(_EMPTY)
+    while active:
+        old, swapped = dr.scatter_cas(table, mi.UInt32(_EMPTY), index, slot, active)
+        found = dr.select(swapped, index, old)
+        equal = mi.Bool(True)
+        for word in keys:
+            equal &= dr.gather(mi.UInt32, word, found, active) == dr.gather(mi.UInt32, word, index, active)
+        done = active & (swapped | equal)
+        result = dr.select(done, found, result)
+        slot = (slot + 1) & mask
+        active &= ~done
+    return result
+
+
+@dataclass
+class EdgeTable:
+    """The directed edges of a mesh (three per face, in face order) and the edge each belongs to."""
+
+    start: object       #: ``UInt32``, 3F: first vertex, an index into the mesh's own vertex buffer
+    end: object         #: ``UInt32``, 3F: second vertex
+    edge: object        #: ``UInt32``, 3F: representative directed edge
+    forward: object     #: ``Bool``, 3F: whether it runs from the lower to the higher welded vertex
+    valid: object       #: ``Bool``, 3F: false for the edges of degenerate faces
+    seam: object        #: ``Bool``, 3F: an end point is a duplicate of another vertex
+    degree: object      #: ``Int32``, 3F: number of faces at the edge, stored at its representative
+
+    @property
+    def face_count(self) -> int:
+        return dr.width(self.start) // 3
+
+
+def build_edge_table(positions, faces) -> EdgeTable:
+    """The edges of a mesh, vertices at exactly the same position counting as one.
+
+    Welding by position keeps texture seams from looking like open boundaries. Faces with two equal
+    (welded) corners are left out, so padding by degenerate faces is free.
+
+    Parameters
+    ----------
+    positions:
+        ``Float``, 3V, interleaved.
+    faces:
+        ``UInt32``, 3F, vertex indices.
+
+    >>> quad = mi.Float(0, 0, 0,  1, 0, 0,  1, 1, 0,  0, 1, 0)
+    >>> table = build_edge_table(quad, mi.UInt32(0, 1, 2,  0, 2, 3,  0, 0, 0))
+    >>> open_edges = table.degree == 1
+    >>> dr.count(open_edges), dr.count(table.degree == 2)
+    (4, 1)
+    """
+    positions = dr.detach(positions)
+    faces = mi.UInt32(faces)
+    dr.make_opaque(positions, faces)
+    vertex_count, corner_count = dr.width(positions) // 3, dr.width(faces)
+
+    vertex = dr.arange(mi.UInt32, vertex_count)
+    # Adding zero turns -0 into +0, which compares equal but has other bits.
+    words = [dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, positions, 3 * vertex + k) + 0.0)
+             for k in range(3)]
+    welded = first_with_equal_key(words, dr.full(mi.Bool, True, vertex_count))
+    duplicates = dr.zeros(mi.UInt32, vertex_count)
+    dr.scatter_add(duplicates, mi.UInt32(1), welded)
+    dr.eval(welded, duplicates)
+
+    corner = dr.arange(mi.UInt32, corner_count)
+    face = corner // 3
+    side = corner - 3 * face
+    start = dr.gather(mi.UInt32, faces, corner)
+    end = dr.gather(mi.UInt32, faces, 3 * face + dr.select(side == 2, 0, side + 1))
+    opposite = dr.gather(mi.UInt32, faces, 3 * face + dr.select(side == 0, 2, side - 1))
+    a, b, c = (dr.gather(mi.UInt32, welded, v) for v in (start, end, opposite))
+    valid = (a != b) & (b != c) & (c != a)
+    forward = a < b
+    edge = first_with_equal_key([dr.minimum(a, b), dr.maximum(a, b)], valid)
+    seam = (dr.gather(mi.UInt32, duplicates, a) > 1) | (dr.gather(mi.UInt32, duplicates, b) > 1)
+
+    degree = dr.zeros(mi.Int32, corner_count)
+    dr.scatter_add(degree, mi.Int32(1), edge, valid)
+    dr.eval(start, end, edge, forward, valid, seam, degree)
+    return EdgeTable(start, end, edge, forward, valid, seam, degree)

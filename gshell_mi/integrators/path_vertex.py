@@ -1,0 +1,83 @@
+"""The terms of one path vertex: sampled without derivatives, evaluated with them.
+
+Paths are written as integrals over surfaces. Every vertex after the first is a material point: it
+keeps its place on its triangle while the triangle moves. Its contribution then depends on its two
+neighbours only, which is what makes path replay possible when geometry moves (Zhang et al. 2020,
+"Path-space differentiable rendering"; Worchel et al. 2025, "Radiative backpropagation with
+non-static geometry"). The Jacobian of a sampled direction is the geometry term times the stretch
+of the triangle, both relative to their present values.
+"""
+
+import drjit as dr
+import mitsuba as mi
+
+
+def mis_weight(pdf_a, pdf_b):
+    """Power heuristic, without derivatives."""
+    a2, b2 = dr.square(dr.detach(pdf_a)), dr.square(dr.detach(pdf_b))
+    return dr.select(a2 > 0, a2 / (a2 + b2), 0)
+
+
+def material_point(pi, ray, active):
+    """The hit as a point of its surface: position and ``n dA``, attached to the shape.
+
+    ``n dA`` is the surface normal times the local stretch of area relative to now; only its
+    derivative and its direction have a meaning.
+    """
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, active)
+    mesh = mi.MeshPtr(pi.shape)
+    index = mesh.face_indices(pi.prim_index, active)
+    p0, p1, p2 = (mesh.vertex_position(index[k], active) for k in range(3))
+    area = dr.norm(dr.cross(p1 - p0, p2 - p0))
+    return si.p, si.n * dr.relative_grad(area)
+
+
+def segment(p, p_next, area_next, valid, d):
+    """Direction to a material point, and the derivative of its solid angle as a factor of value 1.
+
+    ``d``: the direction's present value, kept where ``valid`` is false (the ray left the scene).
+    """
+    offset = p_next - p
+    distance2 = dr.squared_norm(offset)
+    direction = offset * dr.rsqrt(distance2)
+    solid_angle = dr.abs_dot(direction, area_next) / distance2
+    solid_angle = dr.select(valid & (distance2 > 0), solid_angle, 1)
+    return (dr.replace_grad(d, dr.select(valid, direction, d)), dr.relative_grad(solid_angle))
+
+
+def sample_direct(scene, si, bsdf, sample, active, attached, surface_emitters):
+    """Light that one emitter sample sends through the vertex, weighted against BSDF sampling.
+
+    Parameters
+    ----------
+    attached:
+        Whether to track derivatives (a Python ``bool``).
+    surface_emitters:
+        Whether the scene has any area light (a Python ``bool``).
+    """
+    context = mi.BSDFContext()
+    active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    ds, weight = scene.sample_emitter_direction(dr.detach(si), sample, True, active)
+    active &= ds.pdf != 0
+    pdf = ds.pdf
+    if attached:
+        infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        p, solid_angle = ds.p, mi.Float(1)
+        if surface_emitters:
+            on_surface = active & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
+            ray = dr.detach(si).spawn_ray_to(ds.p)
+            ray.maxt = dr.largest(mi.Float)
+            pi = scene.ray_intersect_preliminary(ray, active=on_surface)
+            on_surface &= pi.is_valid()
+            p_em, area_em = material_point(pi, ray, on_surface)
+            p = dr.replace_grad(p, dr.select(on_surface, p_em, p))
+            _, solid_angle = segment(si.p, p, area_em, on_surface, ds.d)
+        offset = p - si.p
+        distance = dr.norm(offset)
+        ds.d = dr.replace_grad(ds.d, dr.select(infinite, ds.d, offset / distance))
+        ds.dist = dr.replace_grad(ds.dist, dr.select(infinite, ds.dist, distance))
+        value = scene.eval_emitter_direction(si, ds, active)
+        weight = dr.replace_grad(weight, value * dr.select(pdf != 0, dr.rcp(pdf), 0))
+        weight *= solid_angle
+    value, bsdf_pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), active)
+    return dr.select(active, dr.select(ds.delta, 1, mis_weight(pdf, bsdf_pdf)) * value * weight, 0)

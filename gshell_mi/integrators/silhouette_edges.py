@@ -1,0 +1,205 @@
+"""The edges of a scene's meshes at which the image is discontinuous for a pinhole camera."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .edge_table import build_edge_table
+
+
+@dataclass
+class ScreenEdges:
+    """Straight pieces of silhouette, projected to the film.
+
+    Coordinates are pixels relative to the film's crop window, as in ``sensor.sample_direction``.
+    """
+
+    a: object       #: ``Point2f``, attached: first end point
+    b: object       #: ``Point2f``, attached: second end point
+
+    def __len__(self) -> int:
+        return dr.width(self.a)
+
+
+def silhouette_mask(positions, faces, viewpoint):
+    """Which directed edges carry the silhouette seen from a point.
+
+    An edge carries it when all its faces lie on one side of the plane through the edge and the
+    viewpoint: open edges always do, and edges between a face turned to the viewpoint and one turned
+    away. The test does not depend on how the faces are oriented.
+
+    Returns the :class:`~gshell_mi.integrators.edge_table.EdgeTable` and a ``Bool`` of width 3F, true
+    at the representative of each such edge.
+
+    >>> tet = mi.Float(0, 0, 0,  1, 0, 0,  0, 1, 0,  0, 0, 1)
+    >>> faces = mi.UInt32(0, 2, 1,  0, 1, 3,  0, 3, 2,  1, 2, 3)
+    >>> dr.count(silhouette_mask(tet, faces, mi.Point3f(0.2, 0.2, -5))[1])
+    3
+    >>> dr.count(silhouette_mask(tet, faces, mi.Point3f(5, -4, -5))[1])
+    4
+    """
+    table = build_edge_table(positions, faces)
+    n = dr.width(faces)
+    positions = dr.detach(positions)
+    face = dr.arange(mi.UInt32, n) // 3
+    corners = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k)) - viewpoint
+               for k in range(3)]
+    towards = dr.dot(corners[0], dr.cross(corners[1], corners[2])) < 0
+    side = dr.select(towards == table.forward, mi.Int32(1), mi.Int32(-1))
+    sides = dr.zeros(mi.Int32, n)
+    dr.scatter_add(sides, side, table.edge, table.valid)
+    dr.eval(sides)
+    return table, (table.degree > 0) & (dr.abs(sides) == table.degree)
+
+
+def _clip(lo, hi, inside_a, inside_b):
+    """Narrows the interval [lo, hi] of a segment to where the linear function is positive."""
+    cut = inside_a / (inside_a - inside_b)
+    lo = dr.select((inside_a < 0) & (inside_b >= 0), dr.maximum(lo, cut), lo)
+    hi = dr.select((inside_b < 0) & (inside_a >= 0), dr.minimum(hi, cut), hi)
+    return lo, dr.select((inside_a < 0) & (inside_b < 0), -1, hi)
+
+
+def _project(sensor, p):
+    it = dr.zeros(mi.Interaction3f, dr.width(p))
+    it.p = p
+    return mi.Point2f(sensor.sample_direction(it, mi.Point2f(0.5))[0].uv)
+
+
+def _compact(selected, *arrays):
+    index = dr.compress(selected)
+    return [dr.gather(type(x), x, index) for x in arrays]
+
+
+def _mesh_pieces(mesh, sensor, margin, piece_length, to_camera, near):
+    """The silhouette of one mesh in pieces: vertices of the edge, and the interval of it they span."""
+    positions, faces = dr.detach(mesh.vertex_positions_buffer()), mesh.faces_buffer()
+    if dr.width(faces) < 3 or dr.width(positions) < 9:
+        return None
+    viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
+    table, selected = silhouette_mask(positions, faces, viewpoint)
+    start, end = _compact(selected, table.start, table.end)
+    if dr.width(start) == 0:
+        return None
+    p, q = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
+
+    # Near plane, in camera space
+    s0, s1 = _clip(mi.Float(0), mi.Float(1), (to_camera @ p).z - near, (to_camera @ q).z - near)
+    p, q = dr.lerp(p, q, s0), dr.lerp(p, q, s1)
+    zp, zq = dr.maximum((to_camera @ p).z, near), dr.maximum((to_camera @ q).z, near)
+
+    # Frame with its margin, on the film
+    size = mi.Vector2f(sensor.film().crop_size())
+    u, v = project_to_film(sensor, p), project_to_film(sensor, q)
+    t0, t1 = mi.Float(0), mi.Float(1)
+    for k in range(2):
+        t0, t1 = _clip(t0, t1, u[k] + margin, v[k] + margin)
+        t0, t1 = _clip(t0, t1, size[k] + margin - u[k], size[k] + margin - v[k])
+    inside = (s1 > s0) & (t1 > t0) & dr.isfinite(dr.squared_norm(u) + dr.squared_norm(v))
+    count = dr.maximum(mi.UInt32(dr.ceil(dr.norm(v - u) * (t1 - t0) / piece_length)), 1)
+    dr.eval(inside, start, end, count, s0, s1, t0, t1, zp, zq)
+    start, end, count, s0, s1, t0, t1, zp, zq = _compact(inside, start, end, count, s0, s1, t0, t1, zp, zq)
+    if dr.width(start) == 0:
+        return None
+
+    # One entry per piece: mark where the pieces of each edge begin, then count the marks.
+    first = dr.prefix_sum(count)
+    total = dr.sum(count)[0]
+    mark = dr.zeros(mi.UInt32, total)
+    dr.scatter(mark, mi.UInt32(1), first, mode=dr.ReduceMode.Permute)
+    edge = dr.cumsum(mark) - 1
+    number = mi.Float(dr.arange(mi.UInt32, total) - dr.gather(mi.UInt32, first, edge))
+    step = dr.rcp(mi.Float(dr.gather(mi.UInt32, count, edge)))
+    dr.eval(edge)
+    start, end, s0, s1, t0, t1, zp, zq = (
+        dr.gather(type(x), x, edge) for x in (start, end, s0, s1, t0, t1, zp, zq))
+
+    def along(x):
+        t = dr.lerp(t0, t1, x)
+        s = t * zp / dr.fma(t, zp, (1 - t) * zq)    # film to edge parameter, perspective-correct
+        return dr.lerp(s0, s1, s)
+
+    return start, end, along(number * step), along((number + 1) * step)
+
+
+def project_to_film(sensor, p):
+    """Pixel coordinates of world points, relative to the crop window; attached to both arguments."""
+    it = dr.zeros(mi.Interaction3f, dr.width(p))
+    it.p = p
+    return mi.Point2f(sensor.sample_direction(it, mi.Point2f(0.5))[0].uv)
+
+
+def _seen(scene, viewpoint, p, q):
+    """Whether anything of a piece can be seen: false only if all of a few test rays are blocked."""
+    seen = dr.zeros(mi.Bool, dr.width(p))
+    for t in (0.02, 0.5, 0.98):
+        target = dr.lerp(p, q, t)
+        d = target - viewpoint
+        distance = dr.norm(d)
+        ray = mi.Ray3f(viewpoint, d / distance, distance * (1 - 2e-3), 0.0, mi.Color0f())
+        seen |= ~scene.ray_test(ray)
+    return seen
+
+
+def screen_edges(scene, sensor, margin, *, piece_length=4.0, cull=True):
+    """All silhouettes of the scene's meshes, projected and cut into short pieces.
+
+    Parameters
+    ----------
+    scene, sensor:
+        The scene, and a perspective sensor.
+    margin:
+        Width in pixels of the band around the crop window from which edges are kept.
+    piece_length:
+        Greatest length of a piece in pixels.
+    cull:
+        Leave out pieces that other surfaces hide.
+
+    Returns
+    -------
+    ``ScreenEdges``, or ``None`` if there are none.
+    """
+    to_camera = dr.detach(sensor.world_transform()).inverse()
+    near = max(sensor.near_clip(), 1e-6)
+    viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
+    parts = []
+    for shape in scene.shapes():
+        if not shape.is_mesh():
+            continue
+        pieces = _mesh_pieces(shape, sensor, margin, piece_length, to_camera, near)
+        if pieces is None:
+            continue
+        positions = shape.vertex_positions_buffer()
+        start, end, lo, hi = pieces
+        if cull:
+            flat = dr.detach(positions)
+            p, q = dr.gather(mi.Point3f, flat, start), dr.gather(mi.Point3f, flat, end)
+            seen = _seen(scene, viewpoint, dr.lerp(p, q, lo), dr.lerp(p, q, hi))
+            dr.eval(seen, start, end, lo, hi)
+            start, end, lo, hi = _compact(seen, start, end, lo, hi)
+            if dr.width(start) == 0:
+                continue
+        dr.eval(start, end, lo, hi)
+        with dr.resume_grad():
+            p, q = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
+            parts.append((project_to_film(sensor, dr.lerp(p, q, lo)),
+                          project_to_film(sensor, dr.lerp(p, q, hi))))
+    if not parts:
+        return None
+    with dr.resume_grad():
+        return ScreenEdges(*(_concatenate([part[k] for part in parts]) for k in range(2)))
+
+
+def _concatenate(arrays):
+    """``dr.concat`` bakes the sizes into the kernel; scattering does not."""
+    if len(arrays) == 1:
+        return arrays[0]
+    result = dr.zeros(mi.Point2f, sum(dr.width(x) for x in arrays))
+    offset = 0
+    for x in arrays:
+        index = dr.arange(mi.UInt32, dr.width(x)) + dr.opaque(mi.UInt32, offset)
+        for k in range(2):
+            dr.scatter(result[k], x[k], index, mode=dr.ReduceMode.Permute)
+        offset += dr.width(x)
+    return result
