@@ -1,0 +1,65 @@
+# make fit    set everything up and reconstruct SCENE (default scenes/tshirt.xml) into OUT
+# make test   set everything up, check the style and run the tests
+# make scenes rebuild the scenes from code
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+SCENE ?= scenes/tshirt.xml
+OUT ?= out/$(basename $(notdir $(SCENE)))
+VENV ?= .venv
+PY := $(VENV)/bin/python
+
+# BLAS threads and Dr.Jit's thread pool fight for the same cores.
+export OPENBLAS_NUM_THREADS ?= 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help fit test scenes clean
+
+help:
+	@sed -n 's/^# //p' Makefile | head -3
+
+fit: $(VENV)/.llvm
+	@$(PY) -m gshell_mi.fit $(SCENE) -o $(OUT) $(ARGS)
+
+test: $(VENV)/.test $(VENV)/.llvm
+	@$(PY) -m ruff check --quiet .
+	@$(PY) -m pytest $(ARGS)
+
+scenes: $(VENV)/.test $(VENV)/.llvm
+	@$(PY) pipelines/make_scenes.py $(ARGS)
+
+clean:
+	rm -rf $(VENV) build *.egg-info
+
+# Stamps: what a folder of pip's cannot tell make is done.
+$(VENV)/.package: $(PY) pyproject.toml
+	@echo "Installing gshell_mi into $(VENV) ..."
+	@$(PY) -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/.test: $(VENV)/.package
+	@echo "Installing the tests' tools into $(VENV) ..."
+	@$(PY) -m pip install --quiet --editable '.[test]'
+	@touch $@
+
+$(VENV)/.llvm: $(VENV)/.package
+	@if ! $(PY) -m gshell_mi.doctor --llvm; then .ci/apt-install libllvm; $(PY) -m gshell_mi.doctor --llvm; fi
+	@touch $@
+
+# A name on the path may be a shim that does not run, so candidates are tried.
+$(PY):
+	@for python in $(PYTHON) python3.12 python3.11 python3 python; do \
+	    if $$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null; then \
+	        echo "Creating $(VENV) with $$($$python --version) ..."; \
+	        $$python -m venv $(VENV) >/dev/null && exit 0; \
+	        rm -rf $(VENV); \
+	        .ci/apt-install "$$($$python -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])')"; \
+	        $$python -m venv $(VENV) && exit 0; \
+	        exit 2; \
+	    fi; \
+	done; \
+	echo "gshell_mi needs Python 3.11 or 3.12, and none was found: install one (Debian, Ubuntu: python3 python3-venv) or name it with make PYTHON=/path/to/python" >&2; \
+	exit 2
