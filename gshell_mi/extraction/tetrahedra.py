@@ -95,6 +95,8 @@ def _expand(bits: Any, log2_slots: int) -> tuple[Any, Any]:
     mask = (1 << log2_slots) - 1
     lane = dr.arange(uint_t, dr.width(bits) << log2_slots)
     lane = dr.compress(dr.gather(uint_t, bits, lane >> log2_slots) >> (lane & mask) & 1 == 1)
+    if dr.width(lane) == 0:  # literals of size 1 do not go together with arrays of size 0
+        return lane, lane
     return lane >> log2_slots, lane & mask
 
 
@@ -163,10 +165,13 @@ class _Extraction:
             positive = self.edge_points(s, a, b).interpolate(dr.detach(msdf)) >= 0
             kept, dropped = dr.compress(positive), dr.compress(~positive)
         kept_count = dr.width(kept)
-        if kept_count == count:
+        if kept_count == 0 and not with_template:
+            return self.empty_mesh(False)
+        if kept_count in (0, count):
             points = self.edge_points(sdf, a, b)
-            closed = self.mesh((points,), self.triangulate(polygons), msdf, deform, kept_count)
-            return replace(closed, template=closed) if with_template else closed
+            uncut = self.mesh((points,), self.triangulate(polygons), msdf, deform, kept_count)
+            mesh = uncut if kept_count else self.empty_mesh(False)
+            return replace(mesh, template=uncut) if with_template else mesh
 
         # Kept vertices first, so that those of the open surface and of its template agree.
         order = dr.empty(self.uint_t, count)
@@ -180,10 +185,8 @@ class _Extraction:
         )
         template = None
         if with_template:
-            blocks = (kept_points, dropped_points) if kept_count else (dropped_points,)
+            blocks = (kept_points, dropped_points)
             template = self.mesh(blocks, self.triangulate(polygons), msdf, deform, kept_count)
-        if kept_count == 0:
-            return replace(self.empty_mesh(False), template=template)
         faces, start, end = self.clip(polygons, record, count, kept_count)
         blocks = (kept_points,)
         if dr.width(start):
@@ -272,6 +275,8 @@ class _Extraction:
             slots: bits of the triangles that each polygon gives; None for all.
         """
         polygon, second = _expand(polygons.quad * 2 + 1 if slots is None else slots, 1)
+        if dr.width(polygon) == 0:
+            return dr.zeros(self.faces_t, 0)
         c0, c1, c2, c3 = (dr.gather(self.uint_t, c, polygon) for c in polygons.corners)
         faces = self.faces_t(c0, dr.select(second == 1, c2, c1), dr.select(second == 1, c3, c2))
         dr.eval(faces)
