@@ -145,7 +145,8 @@ class GShellPathIntegrator(ADIntegrator):
                     on_p = self._replay(mode, *tail, adjoint, mi.Vector3f(0))
                 total += dr.dot(si.p, on_p)
             return total
-        dr.forward_to(radiance, si.p, *film_terms)
+        # Interior gradients are results too, and the replay needs those of the inputs again.
+        dr.forward_to(radiance, si.p, *film_terms, flags=dr.ADFlag.ClearEdges)
         tangent, p_tangent = dr.grad(radiance), mi.Vector3f(dr.grad(si.p))
         film_tangents = [dr.grad(x) for x in film_terms]
         if deeper:
