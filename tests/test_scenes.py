@@ -10,7 +10,7 @@ import trimesh
 
 SCENES = Path(__file__).parents[1] / "scenes"
 #: name: boundary loops, genus
-TRUTH = {"tshirt": (4, 0)}
+TRUTH = {"bunny": (0, 1), "leaf": (1, 0), "tshirt": (4, 0), "vase": (1, 0)}
 
 
 @pytest.fixture(scope="module", params=TRUTH)
