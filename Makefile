@@ -45,8 +45,11 @@ $(VENV)/.test: $(VENV)/.package
 	@$(PY) -m pip install --quiet --editable '.[test]'
 	@touch $@
 
+# Dr.Jit's wheels leave two libraries to the system: libatomic, and LLVM, which they load when first used.
 $(VENV)/.llvm: $(VENV)/.package
-	@if ! $(PY) -m gshell_mi.doctor --llvm; then .ci/apt-install libllvm; $(PY) -m gshell_mi.doctor --llvm; fi
+	@$(PY) -c 'import drjit' 2>/dev/null || .ci/apt-install libatomic1
+	@$(PY) -m gshell_mi.doctor --llvm 2>/dev/null || .ci/apt-install libllvm
+	@$(PY) -m gshell_mi.doctor --llvm
 	@touch $@
 
 # A name on the path may be a shim that does not run, so candidates are tried.
