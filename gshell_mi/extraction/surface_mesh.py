@@ -27,11 +27,11 @@ class EdgePoints:
         return _lerp(fetch(self.a), fetch(self.b), self.t)
 
     def interpolate(self, field: Any) -> Any:
-        return self.apply(lambda vertex: dr.gather(type(field), field, vertex))
+        return self.apply(lambda vertex: gather(type(field), field, vertex))
 
     def at(self, index: Any) -> "EdgePoints":
         a, b = (dr.gather(type(index), x, index) for x in (self.a, self.b))
-        return EdgePoints(a, b, dr.gather(type(self.t), self.t, index))
+        return EdgePoints(a, b, gather(type(self.t), self.t, index))
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class SurfaceMesh:
             )
         if self.stencil is None:
             return dr.zeros(type(field), 0)
-        return self.stencil.apply(lambda vertex: dr.gather(type(field), field, vertex))
+        return self.stencil.apply(lambda vertex: gather(type(field), field, vertex))
 
     def to_numpy(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices (V, 3) float32, faces (F, 3) int64 and mSDF (V,) float32 on the host."""
@@ -138,6 +138,15 @@ class SurfaceMesh:
         """A detached copy for trimesh, with ``msdf`` among its vertex attributes."""
         vertices, faces, msdf = self.to_numpy()
         return trimesh.Trimesh(vertices, faces, vertex_attributes={"msdf": msdf}, process=False)
+
+
+def gather(kind: type, source: Any, index: Any) -> Any:
+    """``dr.gather`` whose adjoint is the same kernel for every size of ``source``.
+
+    The default strategy for the adjoint of small arrays (``dr.ReduceMode.Expand``) writes their size into
+    the kernel.
+    """
+    return dr.gather(kind, source, index, mode=dr.ReduceMode.Local)
 
 
 def _lerp(start: Any, end: Any, t: Any) -> Any:

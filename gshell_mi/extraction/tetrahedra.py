@@ -23,7 +23,7 @@ import drjit as dr
 from ..errors import UserError
 from ..lattice import TetLattice, array_type
 from . import tables
-from .surface_mesh import CutPoints, EdgePoints, Stencil, SurfaceMesh, concatenate
+from .surface_mesh import CutPoints, EdgePoints, Stencil, SurfaceMesh, concatenate, gather
 
 #: Field values smaller than this count as this, so that gradients of slivers stay below 1e7.
 FIELD_FLOOR = 1e-7
@@ -320,7 +320,8 @@ class _Extraction:
 
         cut_faces = dr.zeros(self.uint_t, count)  # per cell: bits of its faces that are cut
         for owner, kind, cut in zip(owners, kinds, cuts, strict=True):
-            dr.scatter_reduce(dr.ReduceOp.Or, cut_faces, self.uint_t(1) << kind, owner, cut)
+            bit = self.uint_t(1) << kind
+            dr.scatter_reduce(dr.ReduceOp.Or, cut_faces, bit, owner, cut, dr.ReduceMode.Local)
         before = dr.prefix_reduce(dr.ReduceOp.Add, dr.popcnt(cut_faces))
         cut_count = dr.sum(dr.popcnt(cut_faces))[0]
 
@@ -373,7 +374,7 @@ class _Extraction:
         return 0.5 * m0 / (0.5 * m0 + 0.5 * m1)
 
     def edge_points(self, sdf: Any, a: Any, b: Any) -> EdgePoints:
-        s_a, s_b = dr.gather(self.float_t, sdf, a), dr.gather(self.float_t, sdf, b)
+        s_a, s_b = gather(self.float_t, sdf, a), gather(self.float_t, sdf, b)
         return EdgePoints(a, b, self.zero_crossing(s_a, s_b))
 
     def mesh(self, blocks: tuple, faces: Any, msdf: Any, deform: Any, kept_count: int) -> SurfaceMesh:
@@ -381,7 +382,7 @@ class _Extraction:
             p = self.lattice.positions_of(vertex, self.float_t)
             if deform is None:
                 return p
-            offset = dr.clip(dr.gather(self.vertices_t, deform, vertex), -1, 1)
+            offset = dr.clip(gather(self.vertices_t, deform, vertex), -1, 1)
             return dr.fma(offset, dr.opaque(self.float_t, self.lattice.max_offset), p)
 
         stencil = Stencil(blocks)
