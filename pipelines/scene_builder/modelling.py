@@ -72,7 +72,10 @@ def isosurface(f: Field, lo, hi, cell: float) -> trimesh.Trimesh:
     n = np.ceil((hi - lo) / cell).astype(int) + 1
     axes = [lo[i] + cell * np.arange(n[i]) for i in range(3)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    v, faces, _, _ = skimage.measure.marching_cubes(f(grid).reshape(n), 0.0, spacing=(cell,) * 3)
+    value = f(grid).reshape(n)
+    # A zero at a grid point would leave faces without area.
+    value = np.where(np.abs(value) < 1e-3 * cell, 1e-3 * cell, value)
+    v, faces, _, _ = skimage.measure.marching_cubes(value, 0.0, spacing=(cell,) * 3)
     return trimesh.Trimesh(v + lo, faces, process=True)
 
 
@@ -132,7 +135,7 @@ def relax(mesh: trimesh.Trimesh, f: Field, nu: Field | None = None, steps: int =
     cols = np.concatenate([keep[:, 1], keep[:, 0], inner[:, 1], inner[:, 0]])
     used = ~rim[rows] | (np.arange(len(rows)) < 2 * len(keep))
     a = sp.csr_matrix((np.ones(used.sum()), (rows[used], cols[used])), shape=(n, n))
-    a = sp.diags(1 / np.maximum(a.sum(1).A1 if hasattr(a.sum(1), "A1") else np.ravel(a.sum(1)), 1)) @ a
+    a = sp.diags(1 / np.ravel(a.sum(1))) @ a
     for _ in range(steps):
         v = project(f, v + 0.5 * (a @ v - v), 1)
         if nu is not None and rim.any():
