@@ -1,1 +1,203 @@
-"""The ``gshell`` shape plugin."""
+"""The ``gshell`` shape plugin: a Mitsuba mesh that is extracted from fields on a lattice."""
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import compat
+from .errors import UserError
+from .extraction import SurfaceMesh, extract
+from .extraction.surface_mesh import gather
+from .fields import LatticeFields, from_mesh, sphere
+from .lattice import TetLattice
+
+_FIELDS = ("sdf", "msdf", "deform")
+_LATTICE_PREFIX = "lattice_"
+
+
+class GShell(mi.Mesh):
+    """G-Shell (``gshell``): the surface ``{sdf = 0, msdf >= 0}`` of fields on a lattice.
+
+    ======================  =================================================================
+    ``resolution``          integer: cells per side of the lattice (default: that of the file, or 64)
+    ``grid``                string: ``tet``
+    ``to_world``            transform: maps the lattice's cube [-1, 1]^3 to the world
+    ``filename``            string: initial fields: an .npz with ``sdf`` and, if wanted, ``msdf`` and
+                            ``deform``, or a mesh file in world space (default: a sphere of radius 0.5
+                            in lattice units)
+    ``face_normals``        boolean: shade with face normals (default: false, smooth normals)
+    (nested)                bsdf: the material
+    ======================  =================================================================
+
+    ``mi.traverse`` shows, beside the parameters of a mesh:
+
+    ======================  =================================================================
+    ``sdf``, ``msdf``       one value per lattice vertex, in lattice units
+    ``deform``              three values per lattice vertex; 1 is the greatest offset that rules out
+                            self-intersection, beyond it they are clipped
+    ``lattice_<name>``      the lattice field of the mesh attribute ``<name>``, after
+                            ``attach_attribute``
+    ======================  =================================================================
+
+    When any of them changes, ``params.update()`` extracts the mesh anew; derivatives of its vertices,
+    normals and attributes lead back to the fields. Vertex and face buffers are padded to sizes from a
+    geometric ladder, as the kernels of a renderer contain buffer sizes: trailing faces are ``(0, 0, 0)``
+    and trailing vertices copies of the first. ``surface`` is the mesh without padding.
+
+    XML: ``<shape type="gshell" id="subject"><integer name="resolution" value="64"/></shape>``
+
+    >>> import mitsuba as mi
+    >>> scene = mi.load_dict({"type": "scene", "subject": {"type": "gshell", "resolution": 16}})
+    >>> params = mi.traverse(scene)
+    >>> params["subject.sdf"] = params["subject.sdf"] - 0.25  # the radius grows to 0.75
+    >>> _ = params.update()
+    >>> bool(scene.ray_intersect(mi.Ray3f([0, 0, -3], [0, 0, 1])).t[0] < 2.26)
+    True
+
+    Raises:
+        UserError: of an unknown grid, a bad resolution or a file that cannot be used.
+    """
+
+    surface: SurfaceMesh
+    """The present mesh in world space, without padding; attached to the fields."""
+
+    def __init__(self, props: mi.Properties):
+        grid = props.get("grid", "tet")
+        if grid != "tet":
+            raise UserError(f"gshell: grid '{grid}' is not available, only 'tet' is")
+        resolution = int(props.get("resolution", 0))
+        filename = props.get("filename", "")
+        smooth = not props.get("face_normals", False)
+        self.to_world = compat.to_world(props)
+        compat.init_mesh(self, props, has_vertex_normals=smooth)
+        fields = _initial_fields(filename, resolution, self.to_world)
+        self.lattice = fields.lattice
+        self.sdf, self.msdf, self.deform = (mi.Float(getattr(fields, name)) for name in _FIELDS)
+        self._attributes: dict[str, tuple[Any, int]] = {}
+        self._mirrored = bool(np.linalg.det(np.array(self.to_world.matrix)[:3, :3]) < 0)
+        self._extract()
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        differentiable = mi.ParamFlags.Differentiable
+        for name in _FIELDS:
+            callback.put(name, getattr(self, name), differentiable | mi.ParamFlags.Discontinuous)
+        for name, (field, _) in self._attributes.items():
+            callback.put(_LATTICE_PREFIX + name, field, differentiable)
+        super().traverse(callback)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        if not keys or any(key in _FIELDS for key in keys):
+            self._extract()
+        elif any(key.startswith(_LATTICE_PREFIX) for key in keys):
+            self._write()
+        else:
+            super().parameters_changed(keys)
+
+    def attach_attribute(self, name: str, field: Any) -> None:
+        """Gives the mesh a vertex attribute that is interpolated from a lattice field.
+
+        The field appears in ``mi.traverse`` as ``lattice_<name>`` and a ``mesh_attribute`` texture reads
+        it by ``name``. An attribute attached before takes on the new field.
+
+        Args:
+            name: starts with ``vertex_``, e.g. ``vertex_color``.
+            field: ``mi.Float`` of one value or, as (r0, g0, b0, r1, ...), three per lattice vertex.
+
+        Raises:
+            UserError: the name or the number of values does not fit.
+        """
+        if not name.startswith("vertex_"):
+            raise UserError(f"the name of a vertex attribute starts with 'vertex_', unlike '{name}'")
+        channels, rest = divmod(dr.width(field), self.lattice.vertex_count)
+        if rest or channels not in (1, 3):
+            raise UserError(
+                f"the attribute '{name}' has {dr.width(field)} values, but the lattice needs "
+                f"{self.lattice.vertex_count} or three times as many"
+            )
+        self._attributes[name] = (mi.Float(field), channels)
+        if self.has_attribute(name):
+            self.remove_attribute(name)
+        self.add_attribute(name, channels, dr.zeros(mi.Float, channels * self.vertex_count()))
+        self._write()
+
+    def template(self) -> SurfaceMesh:
+        """The watertight template of the present fields, in world space."""
+        return self._in_world(extract(self.lattice, *self._fields(), template=True).template)
+
+    def _fields(self) -> tuple[Any, Any, Any]:
+        return self.sdf, self.msdf, self.deform
+
+    def _in_world(self, surface: SurfaceMesh) -> SurfaceMesh:
+        if surface.is_empty:
+            return surface
+        p = mi.Transform4f(self.to_world) @ mi.Point3f(surface.vertices)
+        a, b, c = surface.faces
+        faces = type(surface.faces)(a, c, b) if self._mirrored else surface.faces
+        return replace(surface, vertices=type(surface.vertices)(p), faces=faces)
+
+    def _extract(self) -> None:
+        self.surface = self._in_world(extract(self.lattice, *self._fields()))
+        self._write()
+
+    def _write(self) -> None:
+        """Writes ``surface`` into the buffers of the mesh."""
+        surface = self.surface
+        vertices, faces = _Padding(surface.vertex_count), _Padding(surface.face_count)
+        normals = None
+        if self.has_vertex_normals():
+            normals = dr.ravel(vertices.apply(surface.vertex_normals()))
+        attributes = {
+            name: dr.ravel(vertices.apply(surface.interpolate(field, channels)))
+            for name, (field, channels) in self._attributes.items()
+        }
+        compat.write_mesh(
+            self,
+            dr.ravel(vertices.apply(surface.vertices)),
+            dr.ravel(faces.apply(surface.faces, fill_with_zero=True)),
+            normals,
+            **attributes,
+        )
+
+    def to_string(self) -> str:
+        return (
+            f"GShell[resolution={self.lattice.resolution}, vertices={self.surface.vertex_count}, "
+            f"faces={self.surface.face_count}]"
+        )
+
+
+class _Padding:
+    """Extends arrays to the next size of a ladder with steps of at most a quarter."""
+
+    def __init__(self, count: int):
+        self.count = count
+        step = max(1 << max(count - 1, 0).bit_length() - 3, 16) if count > 4 else 16
+        self.size = max(-(-count // step) * step, step)
+
+    def apply(self, values: Any, fill_with_zero: bool = False) -> Any:
+        if self.count == 0:
+            return dr.zeros(type(values), self.size)
+        index = dr.arange(mi.UInt32, self.size)
+        exists = index < dr.opaque(mi.UInt32, self.count)
+        padded = gather(type(values), values, dr.select(exists, index, 0))
+        return dr.select(exists, padded, 0) if fill_with_zero else padded
+
+
+def _initial_fields(filename: str, resolution: int, to_world: Any) -> LatticeFields:
+    if not filename:
+        return sphere(TetLattice(resolution or 64))
+    path = mi.file_resolver().resolve(filename)
+    if not str(path).endswith(".npz"):
+        return from_mesh(str(path), TetLattice(resolution or 64), to_world=np.array(to_world.matrix))
+    fields = LatticeFields.load(str(path))
+    if resolution and fields.lattice.resolution != resolution:
+        raise UserError(
+            f"{path}: holds fields of resolution {fields.lattice.resolution}, but the shape asks for "
+            f"{resolution}; leave 'resolution' out or change it"
+        )
+    return fields
+
+
+mi.register_shape("gshell", lambda props: GShell(props))

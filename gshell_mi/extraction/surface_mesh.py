@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from ..errors import UserError
+from ..lattice import array_type
 
 
 @dataclass(frozen=True)
@@ -101,27 +102,43 @@ class SurfaceMesh:
     def is_empty(self) -> bool:
         return self.face_count == 0
 
-    def interpolate(self, field: Any) -> Any:
+    def interpolate(self, field: Any, channels: int = 1) -> Any:
         """Interpolates any lattice field at the vertices with the weights that made their positions.
 
         Args:
-            field: one value per lattice vertex: ``Float`` or ``ArrayNf`` (N channels).
+            field: one value per lattice vertex, ``Float`` or ``ArrayNf`` (N channels); or a flat
+                ``Float`` of ``channels`` consecutive values per lattice vertex.
+            channels: 1 to 4, for flat fields.
 
         Returns:
-            The same type, one value per mesh vertex; differentiable in ``field`` and in ``sdf`` and
-            ``msdf`` through the weights.
+            One value per mesh vertex: the field's type, or ``ArrayNf`` with N = ``channels`` > 1.
+            Differentiable in ``field``, and in ``sdf`` and ``msdf`` through the weights.
 
         Raises:
             UserError: the field has another number of values than the lattice has vertices.
         """
-        if dr.width(field) != self.lattice_vertex_count:
+        needed = self.lattice_vertex_count * channels
+        if dr.width(field) != needed:
             raise UserError(
-                f"a field to interpolate has {dr.width(field)} values, but the lattice has "
-                f"{self.lattice_vertex_count} vertices"
+                f"a field to interpolate has {dr.width(field)} values, but the lattice needs {needed}"
             )
+        kind = type(field) if channels == 1 else array_type(type(field), f"Array{channels}f")
         if self.stencil is None:
-            return dr.zeros(type(field), 0)
-        return self.stencil.apply(lambda vertex: gather(type(field), field, vertex))
+            return dr.zeros(kind, 0)
+        return self.stencil.apply(lambda vertex: gather(kind, field, vertex))
+
+    def vertex_normals(self) -> Any:
+        """Unit normals at the vertices, weighted by area; ``Array3f``, differentiable."""
+        kind = type(self.vertices)
+        if self.is_empty:
+            return dr.zeros(kind, 0)
+        p0, p1, p2 = (gather(kind, self.vertices, index) for index in self.faces)
+        weighted = dr.cross(p1 - p0, p2 - p0)
+        normals = dr.zeros(kind, self.vertex_count)
+        for index in self.faces:
+            dr.scatter_reduce(dr.ReduceOp.Add, normals, weighted, index, mode=dr.ReduceMode.Local)
+        # Opposite faces may cancel out: leave 0 then, not NaN.
+        return normals * dr.rsqrt(dr.maximum(dr.squared_norm(normals), 1e-30))
 
     def to_numpy(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices (V, 3) float32, faces (F, 3) int64 and mSDF (V,) float32 on the host."""

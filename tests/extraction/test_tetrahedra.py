@@ -235,7 +235,7 @@ def test_interpolate_reproduces_positions():
 
 def test_interpolate_needs_one_value_per_lattice_vertex():
     lattice = TetLattice(4)
-    with pytest.raises(UserError, match="8 values, but the lattice has 125"):
+    with pytest.raises(UserError, match="8 values, but the lattice needs 125"):
         extract(lattice, _ball(lattice)).interpolate(dr.zeros(mi.Float, 8))
 
 

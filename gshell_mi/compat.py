@@ -1,0 +1,52 @@
+"""Everything that depends on the version of Mitsuba, in one place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+def environment_data(radiance: mi.TensorXf) -> mi.TensorXf:
+    """The ``data`` parameter of an ``envmap`` emitter for an image of shape (height, width, 3).
+
+    Mitsuba 3.9 stores one column more on either side, copies of the opposite ones, so that bilinear
+    lookups wrap around. Differentiable.
+    """
+    height, width, channels = radiance.shape
+    index = dr.arange(mi.UInt32, height * (width + 2) * channels)
+    channel = index % channels
+    column = (index // channels) % (width + 2)
+    row = index // (channels * (width + 2))
+    source = (row * width + (column + width - 1) % width) * channels + channel
+    return mi.TensorXf(dr.gather(mi.Float, radiance.array, source), (height, width + 2, channels))
+
+
+def init_mesh(mesh: Any, props: Any, has_vertex_normals: bool) -> None:
+    """Constructs a Python subclass of ``mi.Mesh`` as one triangle, to be filled by ``write_mesh``."""
+    mi.Mesh.__init__(mesh, props.plugin_name(), 3, 1, props, has_vertex_normals)
+
+
+def to_world(props: Any) -> mi.ScalarTransform4f:
+    """The property ``to_world``, which Mitsuba hands out in double precision, or the identity."""
+    return mi.ScalarTransform4f(props.get("to_world", mi.ScalarTransform4f()).matrix)
+
+
+def write_mesh(mesh: Any, positions: Any, faces: Any, normals: Any = None, **attributes: Any) -> list[str]:
+    """Replaces the buffers of a mesh, whose sizes may change, and lets it update itself.
+
+    Args:
+        positions, normals: flat ``mi.Float`` of 3 values per vertex.
+        faces: flat ``mi.UInt32`` of 3 indices per face.
+        attributes: flat ``mi.Float`` per attribute that the mesh has.
+    """
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = positions
+    params["faces"] = faces
+    if normals is not None:
+        # Given in the same update, they replace those that Mitsuba would compute.
+        params["vertex_normals"] = normals
+    for name, values in attributes.items():
+        params[name] = values
+    return params.update()

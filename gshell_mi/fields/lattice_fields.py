@@ -1,0 +1,68 @@
+"""The three fields of a G-Shell on a lattice, as they are kept in files."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UserError
+from ..lattice import TetLattice
+
+
+@dataclass(frozen=True)
+class LatticeFields:
+    """``sdf``, ``msdf`` and ``deform`` on the host, float32, in the order of ``TetLattice``'s vertices.
+
+    >>> from gshell_mi.fields import sphere
+    >>> fields = sphere(TetLattice(8))
+    >>> fields.lattice
+    TetLattice(resolution=8)
+    """
+
+    sdf: np.ndarray
+    """Signed distance to the template in lattice units, (n,)."""
+    msdf: np.ndarray
+    """Manifold signed distance in lattice units, >= 0 on the surface, (n,)."""
+    deform: np.ndarray
+    """Offsets of the lattice vertices in [-1, 1], (3 n,): x0, y0, z0, x1, ..."""
+
+    @classmethod
+    def closed(cls, sdf: np.ndarray) -> "LatticeFields":
+        """Fields of a watertight surface: mSDF positive everywhere, no offsets."""
+        sdf = np.asarray(sdf, np.float32).ravel()
+        return cls(sdf, np.ones_like(sdf), np.zeros(3 * sdf.size, np.float32))
+
+    @property
+    def lattice(self) -> TetLattice:
+        return TetLattice(round(self.sdf.size ** (1 / 3)) - 1)
+
+    def save(self, path: str | Path) -> None:
+        """Writes a compressed .npz with the arrays ``sdf``, ``msdf`` and ``deform``."""
+        with open(path, "wb") as file:  # a file object, as NumPy would append .npz to other names
+            np.savez_compressed(file, sdf=self.sdf, msdf=self.msdf, deform=self.deform)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "LatticeFields":
+        """Reads what ``save`` wrote; without ``msdf`` it is 1 and without ``deform`` 0 everywhere.
+
+        Raises:
+            UserError: the file cannot be read, has no ``sdf`` or arrays that do not fit together.
+        """
+        try:
+            with np.load(path) as archive:
+                arrays = {k: np.asarray(archive[k], np.float32).ravel() for k in archive.files}
+        except Exception as error:
+            raise UserError(f"{path}: cannot be read as an .npz archive of fields ({error})") from error
+        if "sdf" not in arrays:
+            raise UserError(f"{path}: holds no array 'sdf' (it has {', '.join(arrays) or 'none'})")
+        sdf = arrays["sdf"]
+        stride = round(sdf.size ** (1 / 3))
+        if stride**3 != sdf.size or stride < 2:
+            raise UserError(f"{path}: sdf has {sdf.size} values, which is not (resolution + 1)^3")
+        closed = cls.closed(sdf)
+        fields = cls(sdf, arrays.get("msdf", closed.msdf), arrays.get("deform", closed.deform))
+        for name, needed in (("msdf", sdf.size), ("deform", 3 * sdf.size)):
+            size = getattr(fields, name).size
+            if size != needed:
+                raise UserError(f"{path}: {name} has {size} values, but sdf needs {needed} of them")
+        return fields
