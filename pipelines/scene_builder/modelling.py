@@ -25,6 +25,11 @@ def smooth_step(x: np.ndarray, lo: float, hi: float) -> np.ndarray:
     return t * t * (3 - 2 * t)
 
 
+def mirrored(p: np.ndarray) -> np.ndarray:
+    """Points folded to x >= 0, which makes what is modelled there left-right symmetric."""
+    return np.abs(p) * [1, 0, 0] + p * [0, 1, 1]
+
+
 def segment(p: np.ndarray, a, b) -> tuple[np.ndarray, np.ndarray]:
     """Distance to the segment ``ab``, and the parameter in [0, 1] of the nearest point on it."""
     a, b = np.asarray(a, float), np.asarray(b, float)

@@ -5,19 +5,15 @@ import trimesh
 
 from ..files import SceneObject
 from ..lights import sunny_sky
-from ..modelling import capsule, ellipsoid, isosurface, project, relax, smooth_step, smooth_union, torus
+from ..modelling import capsule, ellipsoid, isosurface, mirrored, project, relax, smooth_step, smooth_union, torus
 
 FUR, PALE, PINK, DARK = (np.array(c) for c in (
     [0.42, 0.24, 0.13], [0.82, 0.74, 0.62], [0.72, 0.32, 0.30], [0.03, 0.025, 0.025]))
 
 
-def _mirrored(p: np.ndarray) -> np.ndarray:
-    return np.stack([np.abs(p[:, 0]), p[:, 1], p[:, 2]], 1)
-
-
 def _ears(p: np.ndarray) -> np.ndarray:
     """Two flattened, slightly parted ears."""
-    q = (_mirrored(p) - [0.13, 0.50, 0.26]) @ _ear_frame()
+    q = (mirrored(p) - [0.13, 0.50, 0.26]) @ _ear_frame()
     return ellipsoid(q, [0, 0.24, 0], [0.105, 0.30, 0.07])
 
 
@@ -36,7 +32,7 @@ def _ring(p: np.ndarray) -> np.ndarray:
 
 
 def _body(p: np.ndarray) -> np.ndarray:
-    q = _mirrored(p)
+    q = mirrored(p)
     d = ellipsoid(p, [0, -0.30, -0.10], [0.40, 0.40, 0.52])
     d = smooth_union(d, ellipsoid(p, [0, 0.26, 0.36], [0.27, 0.25, 0.29]), 0.16)  # head
     d = smooth_union(d, ellipsoid(p, [0, 0.18, 0.58], [0.13, 0.10, 0.12]), 0.10)  # muzzle
@@ -50,7 +46,7 @@ def _body(p: np.ndarray) -> np.ndarray:
 
 def _colour(p: np.ndarray) -> np.ndarray:
     """Brown fur; pale belly, muzzle and tail; pink inside the ears; dark eyes and nose."""
-    q = _mirrored(p)
+    q = mirrored(p)
     color = np.broadcast_to(FUR, p.shape)
 
     def paint(color, over, distance, softness=0.02):

@@ -6,7 +6,7 @@ import trimesh
 from ..cloth import drape
 from ..files import SceneObject
 from ..lights import sunny_sky
-from ..modelling import capsule, cut, isosurface, relax, segment, smooth_step, smooth_union
+from ..modelling import capsule, cut, isosurface, mirrored, relax, segment, smooth_step, smooth_union
 
 CREAM, TEAL = np.array([0.80, 0.73, 0.60]), np.array([0.03, 0.23, 0.27])
 ARMS_CUT, ARMS_WORN = 0.62, 0.95  # radians below the horizontal: as sewn, as draped
@@ -14,9 +14,11 @@ SHOULDER = np.array([0.40, 0.46, 0.0])
 
 
 def _figure(p: np.ndarray, arm_angle: float, torso: float, sleeve: float, flare: float) -> np.ndarray:
-    """Trunk and arms, the arms ``arm_angle`` radians below the horizontal, enlarged by the ease given."""
-    q = p * [1, 1, 1]
-    q[:, 0] = np.abs(q[:, 0])  # left-right symmetric
+    """Distance to trunk and arms, the arms ``arm_angle`` radians below the horizontal.
+
+    ``torso`` and ``sleeve`` enlarge the figure to the cloth around it, ``flare`` widens it downwards.
+    """
+    q = mirrored(p)
     # An upright tube flattened front to back.
     flat = q * [1, 1, 1.7]
     d = capsule(flat, [0, 0.24, 0], [0, -1.5, 0], 0.42 + torso, 0.40 + torso + flare) / 1.25
@@ -28,14 +30,12 @@ def _figure(p: np.ndarray, arm_angle: float, torso: float, sleeve: float, flare:
 
 def _pattern(p: np.ndarray) -> np.ndarray:
     """The closed template that the pattern is cut from, arms raised."""
-    return _figure(p, ARMS_CUT, 0.05, 0.02, 0.12)
+    return _figure(p, ARMS_CUT, 0.05, 0.005, 0.12)
 
 
 def _openings(p: np.ndarray, hem: float = -0.70) -> np.ndarray:
     """Positive on the cloth: above the hem, before the cuffs, outside the neck hole."""
-    q = p * [1, 1, 1]
-    q[:, 0] = np.abs(q[:, 0])
-    along = (q - SHOULDER) @ [np.cos(ARMS_CUT), -np.sin(ARMS_CUT), 0]
+    along = (mirrored(p) - SHOULDER) @ [np.cos(ARMS_CUT), -np.sin(ARMS_CUT), 0]
     neck = np.linalg.norm((p - [0, 0.70, 0.07]) / [0.21, 0.19, 0.20], axis=1) - 1
     cuff = np.maximum(0.40 - along, 0.05 - p[:, 1])  # the trunk's flank also lies beyond that plane
     collar = np.minimum(0.2 * neck, 0.75 - p[:, 1])  # and the neck goes on above the hole
@@ -80,4 +80,4 @@ def build() -> SceneObject:
     shirt = trimesh.Trimesh(draped, pattern.faces, process=False).subdivide_loop(1)
     rest = pattern.subdivide_loop(1)
     color = _colour(np.asarray(rest.vertices), rest.vertex_normals)
-    return SceneObject(shirt, color, sunny_sky(35, 50), roughness=0.85)
+    return SceneObject(shirt, color, sunny_sky(62, 42), roughness=0.85)
