@@ -1,22 +1,12 @@
 """The reparameterised path integrator ``gshell_path``."""
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from . import reparameterised_film
+from .path_sample import PathSample
 from .path_vertex import material_point, mis_weight, sample_direct, segment
-
-
-@dataclass
-class PathSample:
-    """What one camera ray returns."""
-
-    value: object   #: ``Spectrum``: radiance
-    alpha: object   #: ``Float``: coverage
-    aovs: object    #: list of ``Float``
 
 
 class GShellPathIntegrator(ADIntegrator):
