@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
+import gshell_mi  # noqa: F401  (registers the gshell shape)
+
 SCENES = Path(__file__).parents[1] / "scenes"
 #: name: boundary loops, genus
 TRUTH = {"bunny": (0, 1), "leaf": (1, 0), "tshirt": (4, 0), "vase": (1, 0)}
@@ -121,6 +123,13 @@ def test_fit_scene_follows_the_contract(name):
     (include,) = root.iter("include")
     sensors = ET.parse(SCENES / include.get("filename")).getroot()
     assert [s.get("id") for s in sensors.iter("sensor")] == [f"view_{i:03}" for i in range(48)]
+
+
+def test_fit_scene_loads(name):
+    scene = mi.load_file(str(SCENES / f"{name}.xml"))
+    params = mi.traverse(scene)
+    assert {"subject.sdf", "subject.msdf", "subject.deform"} <= set(params.keys())
+    assert len(scene.sensors()) == 48
 
 
 def test_reference_has_the_same_sensors(name, reference):

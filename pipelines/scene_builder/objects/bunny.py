@@ -5,7 +5,17 @@ import trimesh
 
 from ..files import SceneObject
 from ..lights import sunny_sky
-from ..modelling import capsule, ellipsoid, isosurface, mirrored, project, relax, smooth_step, smooth_union, torus
+from ..modelling import (
+    capsule,
+    ellipsoid,
+    isosurface,
+    mirrored,
+    project,
+    relax,
+    smooth_step,
+    smooth_union,
+    torus,
+)
 
 FUR, PALE, PINK, DARK = (np.array(c) for c in (
     [0.42, 0.24, 0.13], [0.82, 0.74, 0.62], [0.72, 0.32, 0.30], [0.03, 0.025, 0.025]))
