@@ -98,35 +98,56 @@ class GShellPathIntegrator(ADIntegrator):
         those of ``film_terms``.
         """
         surface_emitters = _has_surface_emitters(scene)
-        ray_now = dr.detach(ray)
-        with dr.suspend_grad():
-            pi = self._first_hit(scene, ray_now)
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
-        si_now = dr.detach(si)
-        bsdf = si.bsdf(mi.RayDifferential3f(ray_now))
-        active = mi.Bool(True)
+        context = mi.BSDFContext()
+        deeper = self.max_depth > 3
         depth = mi.UInt32(0)
-        first = dr.zeros(mi.SurfaceInteraction3f)
-        emitted = self._emission(scene, si, first, mi.Float(1), mi.Bool(True), depth, active)
-        active_next = active & (depth + 1 < self.max_depth) & si.is_valid()
-        direct = sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, True, surface_emitters)
         with dr.suspend_grad():
-            sample, weight = bsdf.sample(mi.BSDFContext(), si_now, sampler.next_1d(), sampler.next_2d(),
-                                         active_next)
-            ray_next = si_now.spawn_ray(si_now.to_world(sample.wo))
-            delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-            beta, active_next = self._roulette(mi.Spectrum(weight), sample.eta, depth, sampler, active_next)
-            rest = state.value - dr.detach(emitted) - dr.detach(direct)
-            pi_next = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active_next)
-        p_next, area_next = material_point(pi_next, ray_next, active_next)
-        d, solid_angle = segment(si.p, p_next, area_next, active_next & pi_next.is_valid(), ray_next.d)
-        value = bsdf.eval(mi.BSDFContext(), si, si.to_local(d), active_next)
-        indirect = rest * dr.relative_grad(value) * solid_angle
-        radiance = emitted + direct + dr.select(active_next, indirect, 0)
+            pi = self._first_hit(scene, dr.detach(ray))
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        bsdf = si.bsdf(mi.RayDifferential3f(dr.detach(ray)))
+        active = mi.Bool(True)
+        no_vertex = dr.zeros(mi.SurfaceInteraction3f)
+        radiance = self._emission(scene, si, no_vertex, mi.Float(1), mi.Bool(True), depth, active)
+        throughput = mi.Spectrum(1)     # of value 1, carries the derivatives of the vertices so far
+        beta, eta = mi.Spectrum(1), mi.Float(1)
 
-        tail = (scene, sampler, ray_next, pi_next, si_now, rest, beta, sample.eta, sample.pdf, delta,
-                active_next)
-        deeper = self.max_depth > 2
+        # Vertices whose motion depends on that of the one before are differentiated together.
+        for vertex in range(min(self.max_depth - 1, 2)):
+            active &= (depth + 1 < self.max_depth) & si.is_valid()
+            si_now = dr.detach(si)
+            radiance += throughput * beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active, True,
+                                                          surface_emitters)
+            if vertex == 1 and not deeper:
+                break
+            with dr.suspend_grad():
+                sample, weight = bsdf.sample(context, si_now, sampler.next_1d(), sampler.next_2d(), active)
+                ray_next = si_now.spawn_ray(si_now.to_world(sample.wo))
+                delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+                eta *= sample.eta
+                beta, active = self._roulette(beta * weight, eta, depth, sampler, active)
+                pi = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active)
+            p_next, area_next = material_point(pi, ray_next, active)
+            d, solid_angle = segment(si.p, p_next, area_next, active & pi.is_valid(), ray_next.d)
+            value = bsdf.eval(context, si, si.to_local(d), active)
+            to_point = throughput * dr.relative_grad(value) * solid_angle
+            depth = depth + 1
+            if vertex == 1:
+                break
+            # Light of emitters arrives from a point of theirs, all other along a fixed direction: in
+            # these forms the integrand moves least, and emitter sampling uses the same.
+            along = mi.Ray3f(ray_next)
+            along.o = dr.replace_grad(ray_next.o, si.p)
+            si_next = pi.compute_surface_interaction(along, mi.RayFlags.All, active)
+            emitted = beta * self._emission(scene, si_next, si_now, sample.pdf, delta, depth, active)
+            value = bsdf.eval(context, si, si.to_local(ray_next.d), active)
+            throughput = throughput * dr.relative_grad(value)
+            radiance += dr.select(pi.is_valid(), to_point, throughput) * emitted
+            si, bsdf = si_next, si_next.bsdf(mi.RayDifferential3f(dr.detach(ray_next)))
+
+        if deeper:
+            rest = state.value - dr.detach(radiance)
+            radiance += dr.select(active, to_point * rest, 0)
+            tail = (scene, sampler, ray_next, pi, si_now, rest, beta, eta, sample.pdf, delta, active, depth)
         if mode == dr.ADMode.Backward:
             total = on_sample(radiance, state.alpha, state.aovs)
             if deeper:
@@ -146,23 +167,23 @@ class GShellPathIntegrator(ADIntegrator):
 
     @dr.syntax
     def _replay(self, mode, scene, sampler, ray, pi, si_prev, L, beta, eta, pdf_prev, delta_prev, active,
-                adjoint, p_tangent):
-        """Path replay (Vicini et al. 2021) from the second vertex on.
+                depth, adjoint, p_tangent):
+        """Path replay (Vicini et al. 2021) of the remaining vertices.
 
-        Reverse mode takes the adjoint of the radiance and returns that of the first vertex's
-        position; forward mode takes the tangent of that position and returns the radiance's.
+        Reverse mode takes the adjoint of the radiance and returns that of the position of the vertex
+        before; forward mode takes the tangent of that position and returns the radiance's.
         """
         surface_emitters = _has_surface_emitters(scene)
         backward = mode == dr.ADMode.Backward
-        depth = mi.UInt32(1)
+        depth, start = mi.UInt32(depth), mi.UInt32(depth)
         tangent = mi.Spectrum(0)
         on_first = mi.Vector3f(0)
         first_p = mi.Point3f(si_prev.p)
         pi_prev, ray_prev = dr.zeros(mi.PreliminaryIntersection3f, dr.width(pi)), mi.Ray3f(ray)
         active = mi.Bool(active)
 
-        while dr.hint(active, max_iterations=self.max_depth - 1, label="gshell_path (replay)"):
-            second = depth == 1
+        while dr.hint(active, max_iterations=self.max_depth - 2, label="gshell_path (replay)"):
+            second = depth == start
             with dr.resume_grad():
                 p_first = mi.Point3f(first_p)
                 dr.enable_grad(p_first)
