@@ -14,12 +14,12 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 
+from . import __version__
 from .errors import UserError
 
 #: x86 code generation of older versions aborts on the NaN-propagating minimum that Dr.Jit 1.5 emits.
@@ -81,7 +81,7 @@ def diagnose(*, self_test: bool = True) -> Diagnosis:
     """
     found = Diagnosis(
         python=f"{platform.python_version()} on {platform.system()} {platform.machine()}",
-        packages={name: version(name) for name in ("gshell_mi", "mitsuba", "drjit")},
+        packages={"gshell_mi": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__},
         variants=tuple(v for v in mi.variants() if v.endswith("_ad_rgb")),
         llvm_version=_llvm_version(),
         llvm_path=_llvm_path(),
@@ -140,7 +140,8 @@ def _llvm_problem() -> str | None:
                     "correct the path or unset the variable")
         return f"Dr.Jit found no LLVM library: {_INSTALL_LLVM}"
     if found[0] < MINIMUM_LLVM:
-        return f"LLVM {found[0]} at {_llvm_path()} is too old for Dr.Jit {version('drjit')}: {_INSTALL_LLVM}"
+        path = _llvm_path() or "a path that the system does not tell"
+        return f"LLVM {found[0]} at {path} is too old for Dr.Jit {dr.__version__}: {_INSTALL_LLVM}"
     return None
 
 

@@ -140,7 +140,10 @@ def test_written_scene_comes_back(tmp_path):
     mesh = trimesh.creation.box((2, 1, 0.5)).subdivide()
     color = np.linspace(0, 1, 3 * len(mesh.vertices)).reshape(-1, 3)
     light = lights.studio([(0, 45, 10, [1, 1, 1])])
+    (tmp_path / "box").mkdir()
+    (tmp_path / "box" / "view_000.exr").touch()
     files.write_scene("box", files.SceneObject(mesh, color, light, roughness=0.3, views=5), tmp_path)
+    assert not (tmp_path / "box" / "view_000.exr").exists(), "a target of an earlier truth"
     scene = mi.load_file(str(tmp_path / "box" / "reference.xml"))
     params = mi.traverse(scene)
     positions = np.array(params["subject.vertex_positions"]).reshape(-1, 3)

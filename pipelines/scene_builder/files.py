@@ -67,9 +67,14 @@ def scene_xml(*parts: str, spp: int | None = None) -> str:
 
 
 def write_scene(name: str, item: SceneObject, folder: Path) -> None:
-    """Writes ``NAME.xml`` and ``NAME/`` (sensors, reference, test views, truth, light) into ``folder``."""
+    """Writes ``NAME.xml`` and ``NAME/`` (sensors, reference, test views, truth, light) into ``folder``.
+
+    Targets that were rendered there from an earlier truth are removed, so that the fit renders new ones.
+    """
     inside = folder / name
     inside.mkdir(parents=True, exist_ok=True)
+    for stale in inside.glob("view_*.exr"):
+        stale.unlink()
     vertices = centred(item.mesh)
     distance = 1.04 * np.linalg.norm(vertices, axis=1).max() / np.sin(np.radians(FOV / 2))
 
