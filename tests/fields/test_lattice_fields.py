@@ -1,0 +1,50 @@
+import numpy as np
+import pytest
+
+from gshell_mi import UserError
+from gshell_mi.fields import LatticeFields, sphere
+from gshell_mi.lattice import TetLattice
+
+
+def test_round_trip(tmp_path):
+    rng = np.random.default_rng(0)
+    fields = LatticeFields(*(rng.normal(size=n).astype(np.float32) for n in (27, 27, 81)))
+    fields.save(tmp_path / "fields")  # under the very name that was asked for
+    loaded = LatticeFields.load(tmp_path / "fields")
+    for name in ("sdf", "msdf", "deform"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(fields, name))
+    assert loaded.lattice == TetLattice(2)
+
+
+def test_sdf_alone_is_closed(tmp_path):
+    np.savez(tmp_path / "a.npz", sdf=np.zeros((3, 3, 3)))
+    fields = LatticeFields.load(tmp_path / "a.npz")
+    assert (fields.msdf == 1).all() and fields.deform.shape == (81,) and not fields.deform.any()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"msdf": np.ones(8)}, r"holds no array 'sdf' \(it has msdf\)"),
+        ({"sdf": np.ones(9)}, r"sdf has 9 values, which is not \(resolution \+ 1\)\^3"),
+        ({"sdf": np.ones(8), "msdf": np.ones(7)}, "msdf has 7 values, but sdf needs 8"),
+        ({"sdf": np.ones(8), "deform": np.ones(8)}, "deform has 8 values, but sdf needs 24"),
+    ],
+)
+def test_bad_archives(tmp_path, arrays, message):
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(UserError, match=f"a.npz: {message}"):
+        LatticeFields.load(tmp_path / "a.npz")
+
+
+def test_unreadable(tmp_path):
+    (tmp_path / "a.npz").write_bytes(b"nonsense")
+    for name in ("a.npz", "missing.npz"):
+        with pytest.raises(UserError, match=f"{name}: cannot be read as an .npz archive"):
+            LatticeFields.load(tmp_path / name)
+
+
+@pytest.mark.parametrize("radius", [0, 1, -0.5, 2.0])
+def test_sphere_must_fit(radius):
+    with pytest.raises(UserError, match="between 0 and 1, not be"):
+        sphere(TetLattice(4), radius)
