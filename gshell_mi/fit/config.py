@@ -1,0 +1,98 @@
+"""Everything that steers a fit, in one frozen dataclass that is also the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import UserError
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Settings of a fit; the defaults are meant for every object.
+
+    Lengths marked *cells* are in cells of the lattice.
+    """
+
+    seed: int = 0
+    """Seed of every random number of the fit."""
+    resolution: int | None = None
+    """Cells per side of the lattice; default: that of the scene's gshell shape (64)."""
+    known_light: bool = False
+    """Keep the scene's light as it is instead of optimising it."""
+
+    # --- visual hull
+    hull_daylight_votes: float = 0.06
+    """Fraction of the views that must see daylight at a point before an enclosed hole of the masks is carved."""
+
+    # --- radiance ghost: finds the openings
+    ghost_iterations: int = 400
+    """Steps of the radiance ghost."""
+    ghost_batch: int = 65536
+    """Pixels per step, drawn over all views."""
+    ghost_sheets: int = 4
+    """Sheets of the template that a ray composites."""
+    ghost_lr: float = 0.1
+    """Adam's step for opacity logits and radiance; falls tenfold over the stage."""
+    ghost_smoothing: float = 60.0
+    """Lambda of the Sobolev gradient (I + lambda L)^-1 on the template."""
+    ghost_mask: float = 0.01
+    """Weight of the mask loss. The image loss also sees the mask; a large weight closes every cap before
+    the images can open it."""
+    ghost_binary: float = 0.015
+    """Final weight of the loss that makes opacity decide; ramps up over the second half."""
+    ghost_closing: float = 0.003
+    """Final weight of the loss that closes what the images leave undecided."""
+    ghost_chroma: float = 0.003
+    """Weight of the tie between the chroma of a sheet's two sides."""
+    ghost_min_area: float = 0.005
+    """Holes and islands smaller than this fraction of the template's area are noise and are undone."""
+
+    # --- joint stage: geometry, material and light by path tracing
+    iterations: int = 160
+    """Steps of the joint stage."""
+    warmup: float = 0.3
+    """Fraction of these steps in which only material and light move."""
+    spp: int = 8
+    """Samples per pixel of the gradient render."""
+    primal_spp: int = 16
+    """Samples per pixel of the image that the loss compares; independent of the gradient's samples."""
+    max_depth: int = 3
+    """Longest path: 2 is direct light, 3 adds one interreflection."""
+    geometry_lr: float = 0.01
+    """Largest change of sdf and mSDF per step, in cells."""
+    deform_lr: float = 0.005
+    """Largest change of the vertex offsets per step; 1 is the greatest offset allowed."""
+    geometry_smoothing: float = 4.0
+    """Lambda of the Sobolev gradient (I + lambda L)^-1 on the lattice."""
+    material_gradient_smoothing: float = 1.0
+    """Lambda of the material's Sobolev gradient on the lattice; spreads colour to what few pixels see."""
+    material_lr: float = 0.03
+    """Adam's step for base colour, roughness and metallic (logits)."""
+    light_lr: float = 0.03
+    """Adam's step for the environment map (logarithm of its radiance)."""
+    light_height: int = 32
+    """Rows of the optimised environment map; it has twice as many columns."""
+    joint_mask: float = 1.0
+    """Weight of the mask loss."""
+    material_smoothness: float = 0.01
+    """Weight of the difference between the material at a point and at a point nearby."""
+    light_grey: float = 0.005
+    """Weight of the grey-world prior of the light."""
+
+    def __post_init__(self):
+        for name in ("ghost_iterations", "ghost_batch", "ghost_sheets", "spp", "primal_spp", "light_height"):
+            if getattr(self, name) < 1:
+                raise UserError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}.")
+        if self.iterations < 0:
+            raise UserError(f"--iterations must not be negative, and is {self.iterations}.")
+        if self.max_depth < 2:
+            raise UserError(f"--max-depth must be at least 2 (direct light), not {self.max_depth}.")
+        if not 0 <= self.warmup <= 1:
+            raise UserError(f"--warmup is a fraction between 0 and 1, not {self.warmup}.")
+
+
+def default_output(scene: Path) -> Path:
+    """``out/NAME`` for ``.../NAME.xml``."""
+    return Path("out") / scene.stem

@@ -1,0 +1,145 @@
+"""The joint stage: geometry, material and light by differentiable path tracing."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .. import losses
+from ..fields.smoothing import LatticeDiffusion
+from ..light import EnvironmentLight
+from ..material import ATTRIBUTES, MaterialField, principled
+from ..scene import FitScene
+from .config import FitConfig
+
+#: Parameters of the geometry on the lattice, by their names in ``mi.traverse`` of the shape.
+GEOMETRY = ("sdf", "msdf", "deform")
+
+
+class JointStage:
+    """Adam on the lattice fields, the material and the environment map.
+
+    The subject's shape holds the starting geometry. For the first part of the stage only material and
+    light move: geometry gradients mean nothing while the shading is wrong.
+    """
+
+    def __init__(self, fit: FitScene, material: MaterialField, light: EnvironmentLight | None,
+                 config: FitConfig):
+        self.fit, self.material, self.light, self.config = fit, material, light, config
+        self.subject = fit.subject
+        self.subject.set_bsdf(mi.load_dict(principled()))
+        for name, field in material.values().items():
+            self.subject.attach_attribute(name, field)
+        self.scene = optimised_scene(fit, light)
+        self.parameters = mi.traverse(self.scene)
+        self._targets = [mi.TensorXf(target.rgba) for target in fit.targets]
+        self._has_alpha = all(target.has_alpha for target in fit.targets)
+        self._integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
+                                         "hide_emitters": True})
+        self._diffuse = LatticeDiffusion(self.subject.lattice.stride)
+        # One step size for the whole surface: normalising each vertex on its own would undo the smoothing
+        # and let noise move the vertices that few pixels see as far as all others.
+        self.geometry = mi.ad.Adam(lr=config.geometry_lr, uniform=True)
+        for name in GEOMETRY:
+            self.geometry[name] = mi.Float(self.parameters[f"subject.{name}"])
+        self.shading = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
+        if light:
+            self.shading["light"] = light.log_radiance
+
+    @property
+    def optimizers(self) -> dict[str, mi.ad.Adam]:
+        return {"geometry": self.geometry, "shading": self.shading}
+
+    def step(self, iteration: int) -> dict[str, float]:
+        """One step on one view; returns the losses."""
+        config = self.config
+        moving = iteration >= config.warmup * config.iterations
+        self._apply(geometry=moving)
+        index = self._view(iteration)
+        image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[index],
+                          integrator=self._integrator, spp=config.primal_spp, spp_grad=config.spp,
+                          seed=2 * iteration, seed_grad=2 * iteration + 1)
+        target = self._targets[index]
+        color = losses.log_l1(image[..., :3], target[..., :3])
+        mask = losses.mask_l2(image[..., 3], target[..., 3]) if self._has_alpha else mi.Float(0)
+        total = color + config.joint_mask * mask + self._regularisation()
+        dr.backward(total)
+        decay = 0.1 ** (iteration / max(config.iterations, 1))
+        if moving:
+            self._step_geometry(decay)
+        self._step_shading(decay)
+        error = dr.mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]), axis=None)
+        return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
+                "psnr": -10 * float(np.log10(max(error.array[0], 1e-10)))}
+
+    def finish(self) -> None:
+        """Leaves the last step's parameters in the scene."""
+        self._apply(geometry=True)
+
+    def _view(self, iteration: int) -> int:
+        """Every view once per round, in an order that depends on seed and round alone."""
+        count = len(self.fit.sensors)
+        order = np.random.default_rng((self.config.seed, iteration // count)).permutation(count)
+        return int(order[iteration % count])
+
+    def _apply(self, *, geometry: bool) -> None:
+        """Puts the optimisers' parameters into the scene, attached."""
+        if geometry:
+            for name in GEOMETRY:
+                self.parameters[f"subject.{name}"] = self.geometry[name]
+        self.material.parameters = {name: self.shading[name] for name in ATTRIBUTES}
+        for name, field in self.material.values().items():
+            self.parameters[f"subject.lattice_{name}"] = field
+        if self.light:
+            self.light.log_radiance = self.shading["light"]
+            self.light.update(self.parameters)
+        self.parameters.update()
+
+    def _regularisation(self) -> mi.Float:
+        config, surface = self.config, self.subject.surface
+        faces = mi.Vector3u(surface.faces)
+        total = mi.Float(0)
+        for name, field in self.material.values().items():
+            channels = dr.width(field) // self.subject.lattice.vertex_count
+            values = surface.interpolate(field, channels)
+            total += config.material_smoothness * losses.edge_smoothness(values, faces)
+        if self.light:
+            texels = dr.unravel(mi.Color3f, self.light.radiance.array)
+            total += config.light_grey * losses.grey_world(texels)
+        return total
+
+    def _step_geometry(self, decay: float) -> None:
+        optimizer, config = self.geometry, self.config
+        cell = self.subject.lattice.spacing
+        for name in GEOMETRY:
+            gradient = dr.grad(optimizer[name])
+            gradient = dr.select(dr.isfinite(gradient), gradient, 0)
+            dr.set_grad(optimizer[name], self._diffuse(gradient, config.geometry_smoothing))
+        rate = decay * config.geometry_lr * cell
+        optimizer.set_learning_rate({"sdf": rate, "msdf": rate, "deform": decay * config.deform_lr})
+        optimizer.step()
+        optimizer["deform"] = dr.fmin(dr.fmax(optimizer["deform"], -1), 1)
+
+    def _step_shading(self, decay: float) -> None:
+        config, optimizer = self.config, self.shading
+        for name in ATTRIBUTES:
+            gradient = dr.grad(optimizer[name])
+            dr.set_grad(optimizer[name], self._diffuse(gradient, config.material_gradient_smoothing))
+        rates = dict.fromkeys(ATTRIBUTES, decay * config.material_lr)
+        if self.light:
+            rates["light"] = decay * config.light_lr
+        optimizer.set_learning_rate(rates)
+        optimizer.step()
+
+
+def optimised_scene(fit: FitScene, light: EnvironmentLight | None) -> mi.Scene:
+    """The fit scene with the light to optimise in place of its own, and without its sensors."""
+    objects = {"type": "scene", "subject": fit.subject, "light": light.emitter() if light else fit.light}
+    for index, shape in enumerate(fit.scene.shapes()):
+        if shape is not fit.subject:
+            objects[f"shape_{index}"] = shape
+    for index, emitter in enumerate(fit.scene.emitters()):
+        if emitter.id() != "light" and not emitter.is_environment() and not emitter.shape():
+            objects[f"emitter_{index}"] = emitter
+    return mi.load_dict(objects)

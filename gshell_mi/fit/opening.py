@@ -1,0 +1,78 @@
+"""From the ghost's opacity to an mSDF: where the template is cut open."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..extraction.surface_mesh import SurfaceMesh
+from ..fields.smoothing import LatticeDiffusion
+from ..lattice import TetLattice
+from ..topology import vertex_components
+
+#: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
+_CERTAIN = 3.0
+
+
+def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, min_area: float) -> np.ndarray:
+    """Undoes the cuts and the islands that are too small to be meant.
+
+    Args:
+        logits: (V,) opacity logits; surface where positive.
+        vertices, faces: the template.
+        min_area: connected patches of one sign smaller than this fraction of the template's area flip.
+
+    Returns:
+        (V,) logits, those of flipped patches negated.
+    """
+    area = np.zeros(len(vertices))
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    face_area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    for corner in range(3):
+        np.add.at(area, faces[:, corner], face_area / 3)
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    cleaned = logits.copy()
+    # Cuts first: an island in a cut that closes is none.
+    for flip_closed in (False, True):
+        solid = cleaned > 0
+        same = solid[edges[:, 0]] == solid[edges[:, 1]]
+        _, patch = vertex_components(edges[same], len(vertices))
+        small = np.bincount(patch, area)[patch] < min_area * area.sum()
+        flip = small & (solid == flip_closed)
+        cleaned[flip] = -cleaned[flip]
+    return cleaned
+
+
+def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: TetLattice) -> mi.Float:
+    """ν at the lattice vertices such that its interpolation on the template follows ``logits``.
+
+    The scale is about that of a distance: one cell per logit; where the template is far away, 1 cell.
+    """
+    values = mi.Float(np.clip(logits, -_CERTAIN, _CERTAIN).astype(np.float32))
+    msdf, known = splat_to_lattice(values, template, lattice)
+    return dr.select(known, msdf, 1) * lattice.spacing
+
+
+def splat_to_lattice(values: mi.Float, template: SurfaceMesh, lattice: TetLattice) -> tuple[mi.Float, mi.Bool]:
+    """Turns values at the template's vertices, one or three channels, into a lattice field.
+
+    Each lattice vertex takes the mean of the template vertices on its edges, weighted as they
+    interpolate it; its surroundings are extended from there.
+
+    Returns:
+        The field, and a mask of the lattice vertices that have a value.
+    """
+    (points,) = template.stencil.blocks
+    channels = dr.width(values) // template.vertex_count
+    total = dr.zeros(mi.Float, channels * lattice.vertex_count)
+    weight = dr.zeros(mi.Float, lattice.vertex_count)
+    with dr.suspend_grad():
+        for end, share in ((points.a, 1 - points.t), (points.b, points.t)):
+            share = dr.detach(share)
+            dr.scatter_reduce(dr.ReduceOp.Add, weight, share, end)
+            for channel in range(channels):
+                index = channels * dr.arange(mi.UInt32, template.vertex_count) + channel
+                value = dr.gather(mi.Float, values, index)
+                dr.scatter_reduce(dr.ReduceOp.Add, total, share * value, channels * end + channel)
+    return LatticeDiffusion(lattice.stride).extend(total, weight)

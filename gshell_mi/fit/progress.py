@@ -1,0 +1,73 @@
+"""Progress on the terminal: one bar per stage with loss, PSNR, seconds per step and time left."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress as RichProgress, SpinnerColumn, TextColumn
+
+#: Steps whose mean duration predicts the time left; old ones say little about a stage that gets slower.
+_WINDOW = 20
+
+
+class Progress:
+    """Progress bars on stderr; silent if ``quiet``.
+
+    The time left is that of the running stage: the steps that remain times the mean of the last few.
+    """
+
+    def __init__(self, *, quiet: bool = False):
+        self._console = Console(stderr=True, quiet=quiet, highlight=False)
+        self._bars = RichProgress(
+            SpinnerColumn(), TextColumn("{task.description:<12}"), BarColumn(bar_width=24),
+            TextColumn("{task.fields[detail]}"), console=self._console, disable=quiet)
+        self._reference = None
+
+    def __enter__(self) -> Progress:
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._bars.stop()
+
+    def warn(self, message: str) -> None:
+        """One line above the bars."""
+        self._console.print(f"[yellow]warning:[/] {message}")
+
+    @contextmanager
+    def stage(self, name: str, total: int | None, done: int = 0) -> Iterator[Callable]:
+        """A bar for a stage of ``total`` steps; yields the function to call after each of them."""
+        task = self._bars.add_task(name, total=total, completed=done, detail="")
+        durations: deque[float] = deque(maxlen=_WINDOW)
+        begin = last = time.monotonic()
+
+        def advance(values: Mapping[str, float] | None = None) -> None:
+            nonlocal last, done
+            now = time.monotonic()
+            durations.append(now - last)
+            last = now
+            done += 1
+            mean = sum(durations) / len(durations)
+            detail = f"{done}/{total}  {mean:.2f} s/step  {_clock((total - done) * mean)} left"
+            if values and "loss" in values:
+                detail = f"loss {values['loss']:.4f}  PSNR {values['psnr']:.1f} dB  " + detail
+            self._bars.update(task, completed=done, detail=detail)
+
+        yield advance
+        took = f"{time.monotonic() - begin:.1f} s"
+        self._bars.update(task, total=total or 1, completed=total or 1, detail=took)
+
+    def reference(self, done: int, total: int) -> None:
+        """Targets being rendered from a reference scene: ``done`` of ``total``."""
+        if self._reference is None:
+            self._reference = self._bars.add_task("references", total=total, detail="")
+        self._bars.update(self._reference, completed=done, total=total, detail=f"{done}/{total} rendered")
+
+
+def _clock(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    return f"{minutes}:{seconds:02d}"

@@ -1,0 +1,170 @@
+"""The radiance ghost: which parts of a template are surface, found without a light model.
+
+Every vertex of the watertight template carries an opacity and one radiance per side. A pixel's ray
+composites the first few sheets that it meets front to back. Where the object is open (the neck of a
+T-shirt, the rim of a hat) no single radiance of the template's cap agrees with what the views see
+through it, so the cap fades and the inner side behind it takes over. As there is neither a light nor a
+material, nothing can be traded for scale or shading, and a path tracer's noise is absent.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.csgraph
+from cholespy import CholeskySolverF, MatrixType
+
+from .. import losses
+from ..views import PinholeViews
+from .config import FitConfig
+from .pixels import PixelPool
+
+#: Every vertex starts here. Low enough that rays reach the sheets behind, high enough that all are
+#: seen; colours fitted at full opacity would bleed what is inside into the caps.
+_INITIAL_OPACITY = 0.35
+
+_LOGIT_LIMIT = 3.0
+
+
+class RadianceGhost:
+    """Opacity and two-sided radiance on a fixed mesh, trained on random pixels of all views.
+
+    Args:
+        vertices: (V, 3) positions, world units.
+        faces: (F, 3) vertex indices, oriented outwards.
+        views: the cameras.
+        pixels: the targets' pixels.
+        config: ``ghost_*`` fields.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: PinholeViews, pixels: PixelPool,
+                 config: FitConfig):
+        self.views, self.pixels, self.config = views, pixels, config
+        self.vertex_count = len(vertices)
+        self._positions = mi.Float(vertices.ravel())
+        self._faces = mi.UInt32(faces.ravel())
+        self._scene = _scene(self._positions, self._faces, self.vertex_count, len(faces))
+        self._offset = 1e-4 * float(np.ptp(vertices, axis=0).max())
+        self._smoother = _sobolev_solver(faces, self.vertex_count, config.ghost_smoothing)
+        grey = _inverse_softplus(pixels.mean_radiance())
+        self.optimizer = mi.ad.Adam(lr=config.ghost_lr)
+        self.optimizer["opacity"] = dr.full(mi.Float, np.log(_INITIAL_OPACITY / (1 - _INITIAL_OPACITY)),
+                                            self.vertex_count)
+        self.optimizer["front"] = dr.full(mi.Float, grey, 3 * self.vertex_count)
+        self.optimizer["back"] = dr.full(mi.Float, grey, 3 * self.vertex_count)
+
+    def step(self, iteration: int) -> dict[str, float]:
+        """One Adam step on a batch of random pixels; returns the losses."""
+        config, optimizer = self.config, self.optimizer
+        progress = iteration / config.ghost_iterations
+        sample = self.pixels.sample(config.ghost_batch, seed=config.seed, step=iteration)
+        radiance, alpha = self._composite(self._sheets(self.views.rays(sample.view, sample.film)))
+        image = losses.log_l1(radiance, sample.radiance)
+        mask = losses.mask_l2(alpha, sample.alpha)
+
+        opacity = _sigmoid(optimizer["opacity"])
+        front, back = (dr.unravel(mi.Color3f, _softplus(optimizer[side])) for side in ("front", "back"))
+        # Undecided opacity must have its say first; only then is it made to decide.
+        late = dr.opaque(mi.Float, max(0.0, 2 * progress - 1))
+        total = (
+            image
+            + self.pixels.mask_weight(config.ghost_mask) * mask
+            + late * config.ghost_binary * losses.binary_entropy_bound(opacity)
+            + late * config.ghost_closing * losses.transparency(opacity)
+            + config.ghost_chroma * losses.chroma_difference(front, back)
+        )
+        dr.backward(total)
+        optimizer.set_learning_rate(config.ghost_lr * 0.1**progress)
+        for name in ("opacity", "front", "back"):
+            parameter = optimizer[name]
+            dr.set_grad(parameter, self._smooth(dr.grad(parameter)))
+        optimizer.step()
+        error = dr.mean(dr.ravel(dr.square(dr.detach(radiance) - sample.radiance)))
+        return {"loss": total[0], "image": image[0], "mask": mask[0],
+                "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
+
+    def smoothed_logits(self) -> np.ndarray:
+        """(V,) opacity logits, smoothed along the mesh; the surface is where they are positive.
+
+        Only their sign is meant, so they are limited first: a very sure vertex must not outvote its
+        neighbours when the rim is drawn between them.
+        """
+        limited = dr.fmin(dr.fmax(dr.detach(self.optimizer["opacity"]), -_LOGIT_LIMIT), _LOGIT_LIMIT)
+        return self._smooth(limited).numpy()
+
+    def radiance(self) -> tuple[np.ndarray, np.ndarray]:
+        """(V, 3) front and back radiance."""
+        return tuple(_softplus(self.optimizer[side]).numpy().reshape(-1, 3) for side in ("front", "back"))
+
+    def _sheets(self, ray: mi.Ray3f) -> list[tuple]:
+        """The first sheets along each ray: (hit?, vertex indices, barycentric weights, front side?)."""
+        sheets = []
+        active = dr.full(mi.Bool, True, dr.width(ray.o))
+        for _ in range(self.config.ghost_sheets):
+            hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+            active = hit.is_valid()
+            face = dr.gather(mi.Vector3u, self._faces, hit.prim_index, active)
+            a, b, c = (dr.gather(mi.Point3f, self._positions, face[i], active) for i in range(3))
+            front = dr.dot(dr.cross(b - a, c - a), ray.d) < 0
+            # Barycentrics of a miss are not a number, and 0 times that is no 0.
+            uv = dr.select(active, hit.prim_uv, 0)
+            sheets.append((active, face, mi.Vector3f(1 - uv.x - uv.y, uv.x, uv.y), front))
+            ray = mi.Ray3f(ray.o + ray.d * dr.select(active, hit.t + self._offset, 0), ray.d)
+        dr.eval(sheets)
+        return sheets
+
+    def _composite(self, sheets: list[tuple]) -> tuple[mi.Color3f, mi.Float]:
+        """Front-to-back compositing (Porter and Duff 1984, *over*) of radiance and coverage."""
+        opacity, front, back = (self.optimizer[name] for name in ("opacity", "front", "back"))
+        radiance, transmittance = mi.Color3f(0), mi.Float(1)
+        for hit, face, weights, is_front in sheets:
+            logit, color = mi.Float(0), mi.Color3f(0)
+            for corner in range(3):
+                logit += weights[corner] * dr.gather(mi.Float, opacity, face[corner], hit)
+                color += weights[corner] * (
+                    dr.gather(mi.Color3f, front, face[corner], hit & is_front)
+                    + dr.gather(mi.Color3f, back, face[corner], hit & ~is_front)
+                )
+            alpha = dr.select(hit, _sigmoid(logit), 0)
+            radiance += transmittance * alpha * _softplus(color)
+            transmittance *= 1 - alpha
+        return radiance, 1 - transmittance
+
+    def _smooth(self, gradient: mi.Float) -> mi.Float:
+        """Sobolev gradient ``(I + lambda L)^-1 g`` (Nicolet et al. 2021), per channel."""
+        shape = (self.vertex_count, dr.width(gradient) // self.vertex_count)
+        smoothed = dr.empty(mi.TensorXf, shape=shape)
+        self._smoother.solve(mi.TensorXf(gradient, shape), smoothed)
+        return smoothed.array
+
+
+def _scene(positions: mi.Float, faces: mi.UInt32, vertex_count: int, face_count: int) -> mi.Scene:
+    mesh = mi.Mesh("ghost", vertex_count, face_count)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"], parameters["faces"] = positions, faces
+    parameters.update()
+    return mi.load_dict({"type": "scene", "ghost": mesh})
+
+
+def _sobolev_solver(faces: np.ndarray, vertex_count: int, smoothing: float) -> CholeskySolverF:
+    """Cholesky factor of ``I + smoothing * L`` with the combinatorial Laplacian L of the mesh."""
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+    adjacency = sp.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count))
+    system = (sp.eye(vertex_count) + smoothing * sp.csgraph.laplacian(adjacency + adjacency.T)).tocoo()
+    return CholeskySolverF(vertex_count, system.row.astype(np.int32), system.col.astype(np.int32),
+                           system.data.astype(np.float64), MatrixType.COO)
+
+
+def _sigmoid(x):
+    return dr.rcp(1 + dr.exp(-x))
+
+
+def _softplus(x):
+    return dr.fmax(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
+
+
+def _inverse_softplus(y: float) -> float:
+    return float(np.log(np.expm1(max(y, 1e-3))))

@@ -1,0 +1,248 @@
+"""The fit from start to end: hull, ghost, joint stage, export; with checkpoints in between."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UserError
+from ..export import export_fit, make_output_folder
+from ..fields import LatticeFields
+from ..fields.visual_hull import visual_hull
+from ..lattice import TetLattice
+from ..light import EnvironmentLight
+from ..material import MaterialField
+from ..scene import FitScene, load_fit_scene
+from ..views import PinholeViews
+from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
+from .config import FitConfig, default_output
+from .joint import JointStage
+from .opening import clean_opacity, msdf_from_template, splat_to_lattice
+from .pixels import PixelPool
+from .progress import Progress
+from .radiance_ghost import RadianceGhost
+
+#: Seconds between checkpoints: what a kill loses at most.
+CHECKPOINT_SECONDS = 10.0
+
+#: Median reflectance that the first split of radiance into material and light assumes.
+_TYPICAL_REFLECTANCE = 0.5
+
+STAGES = ("hull", "ghost", "joint", "done")
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What a fit leaves behind.
+
+    Attributes:
+        output: the folder.
+        metrics: the contents of ``metrics.json``.
+    """
+
+    output: Path
+    metrics: dict
+
+
+def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: str | Path | None = None,
+              config: FitConfig | None = None, resume: bool = False, overwrite: bool = False,
+              quiet: bool = True) -> FitResult:
+    """Reconstructs the gshell shape of a fit scene, its material and its light.
+
+    A Mitsuba ``llvm`` or ``cuda`` variant must be set.
+
+    Args:
+        scene: the fit scene's XML file.
+        output: the folder to write; default ``out/<scene stem>``.
+        targets: folder of the target images; default beside the XML.
+        config: settings.
+        resume: continue from the checkpoint in ``output``.
+        overwrite: replace an earlier fit in ``output``.
+        quiet: no progress bar.
+
+    Raises:
+        UserError: of anything that the user can mend.
+    """
+    config = config or FitConfig()
+    scene = Path(scene)
+    output = Path(output) if output else default_output(scene)
+    with Progress(quiet=quiet) as progress:
+        return _Fit(scene, output, targets, config, resume, overwrite, progress).run()
+
+
+class _Fit:
+    def __init__(self, scene: Path, output: Path, targets: str | Path | None, config: FitConfig, resume: bool,
+                 overwrite: bool, progress: Progress):
+        self.config, self.progress, self.output = config, progress, output
+        self.path = output / "checkpoint.npz"
+        self.checkpoint = Checkpoint("hull", 0, _plain(config))
+        if resume:
+            self.checkpoint = Checkpoint.load(self.path)
+            _same_config(self.checkpoint.config, _plain(config))
+        make_output_folder(output, keep=resume, overwrite=overwrite)
+        with progress.stage("targets", None):
+            self.scene = load_fit_scene(scene, Path(targets) if targets else None,
+                                        on_reference=progress.reference)
+        self.views = PinholeViews.from_sensors(self.scene.sensors)
+        if not all(target.has_alpha for target in self.scene.targets):
+            progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
+        self.lattice = TetLattice(config.resolution or self.scene.subject.lattice.resolution)
+        self.log = None
+
+    def run(self) -> FitResult:
+        self.log = open(self.output / "log.jsonl", "a")
+        try:
+            if self.checkpoint.stage == "hull":
+                self._hull()
+            if self.checkpoint.stage == "ghost":
+                self._ghost()
+            joint = self._joint()
+            with self.progress.stage("export", None), self._timed("export"):
+                metrics = export_fit(self.output, self.scene, joint, self.config, self.checkpoint.seconds)
+        finally:
+            self.log.close()
+        return FitResult(self.output, metrics)
+
+    # --- stages
+
+    def _hull(self) -> None:
+        with self.progress.stage("visual hull", len(self.views)) as advance, self._timed("hull"):
+            to_world = mi.Transform4f(self.scene.subject.to_world)
+            points = to_world @ mi.Point3f(self.lattice.points(mi.Float))
+            world = visual_hull(points, self.views, [target.rgba[..., 3] for target in self.scene.targets],
+                                daylight_votes=self.config.hull_daylight_votes, progress=advance)
+            sdf = self._closed_at_border(world.numpy() / _length_scale(self.scene.subject.to_world))
+        if not (sdf < 0).any():
+            raise UserError(
+                f"The masks of the targets have no common volume in the box of '{self.scene.path}'; check the "
+                f"cameras, the alpha of the targets and the gshell shape's to_world.")
+        self._enter("ghost", sdf=sdf)
+
+    def _closed_at_border(self, sdf: np.ndarray) -> np.ndarray:
+        """Outside at the cube's faces, so that the template is watertight; finite everywhere."""
+        n, cell = self.lattice.stride, self.lattice.spacing
+        grid = np.clip(sdf, -1.0, 1.0).reshape(n, n, n).astype(np.float32)
+        for axis in range(3):
+            ends = np.moveaxis(grid, axis, 0)
+            ends[[0, -1]] = np.maximum(ends[[0, -1]], 0.5 * cell)
+        return grid.ravel()
+
+    def _ghost(self) -> None:
+        sdf = self.checkpoint.arrays["sdf"]
+        self.scene.subject.set_fields(LatticeFields.closed(sdf))
+        template = self.scene.subject.template()
+        vertices, faces, _ = template.to_numpy()
+        ghost = RadianceGhost(vertices, faces, self.views, PixelPool(self.views, self.scene.targets), self.config)
+        self._iterate("ghost", self.config.ghost_iterations, ghost.step, {"ghost": ghost.optimizer},
+                      {"sdf": sdf})
+        logits = clean_opacity(ghost.smoothed_logits(), vertices, faces, self.config.ghost_min_area)
+        msdf = msdf_from_template(logits, template, self.lattice)
+        front, _ = ghost.radiance()
+        radiance, known = splat_to_lattice(mi.Float(front.ravel()), template, self.lattice)
+        radiance = radiance.numpy().reshape(-1, 3)
+        light = float(np.median(front[logits > 0].mean(axis=1)) if (logits > 0).any() else front.mean())
+        self._enter("joint", sdf=sdf, msdf=msdf.numpy(), radiance=radiance, known=known.numpy(),
+                    light=np.float32(light / _TYPICAL_REFLECTANCE))
+
+    def _joint(self) -> JointStage:
+        start = dict(self.checkpoint.arrays)
+        fields = LatticeFields(start["sdf"], start["msdf"], np.zeros(3 * start["sdf"].size, np.float32))
+        self.scene.subject.set_fields(fields)
+        light = None
+        if not self.config.known_light:
+            light = EnvironmentLight.uniform(self.config.light_height, float(start["light"]))
+        reflectance = np.where(start["known"][:, None], start["radiance"] / start["light"], _TYPICAL_REFLECTANCE)
+        joint = JointStage(self.scene, MaterialField(reflectance), light, self.config)
+        if self.checkpoint.stage == "joint":
+            self._iterate("joint", self.config.iterations, joint.step, joint.optimizers, start)
+        else:
+            for name, optimizer in joint.optimizers.items():
+                restore_optimizer(name, optimizer, self.checkpoint.arrays)
+        joint.finish()
+        if self.checkpoint.stage == "joint":
+            self.checkpoint.stage = "done"
+            self.checkpoint.save(self.path)
+        return joint
+
+    # --- bookkeeping
+
+    def _iterate(self, stage: str, count: int, step: Callable[[int], dict[str, float]],
+                 optimizers: Mapping[str, mi.ad.Adam], constants: dict[str, np.ndarray]) -> None:
+        """Runs the steps of a stage that are left, logging each and saving a checkpoint now and then."""
+        first = self.checkpoint.iteration
+        if first > 0:
+            for name, optimizer in optimizers.items():
+                restore_optimizer(name, optimizer, self.checkpoint.arrays)
+        constants = {name: constants[name] for name in constants if "/" not in name}
+
+        def save(done: int) -> None:
+            arrays = dict(constants)
+            for name, optimizer in optimizers.items():
+                arrays |= optimizer_arrays(name, optimizer)
+            self.checkpoint.iteration, self.checkpoint.arrays = done, arrays
+            self.checkpoint.save(self.path)
+
+        with self.progress.stage(stage, count, first) as advance, self._timed(stage):
+            saved = time.monotonic()
+            for iteration in range(first, count):
+                begin = time.monotonic()
+                values = step(iteration)
+                values = {name: float(value) for name, value in values.items()}
+                self._write_log(stage, iteration, values, time.monotonic() - begin)
+                advance(values)
+                if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                    save(iteration + 1)
+                    saved = time.monotonic()
+        save(count)
+
+    def _enter(self, stage: str, **arrays: np.ndarray) -> None:
+        """Starts a stage from ``arrays``."""
+        self.checkpoint.stage, self.checkpoint.iteration, self.checkpoint.arrays = stage, 0, arrays
+        self.checkpoint.save(self.path)
+
+    def _timed(self, stage: str):
+        return _Stopwatch(self.checkpoint.seconds, stage)
+
+    def _write_log(self, stage: str, iteration: int, values: dict[str, float], seconds: float) -> None:
+        rounded = {name: float(f"{value:.6g}") for name, value in values.items()}
+        self.log.write(json.dumps({"stage": stage, "iteration": iteration, **rounded,
+                                   "seconds": round(seconds, 4)}) + "\n")
+        self.log.flush()
+
+
+class _Stopwatch:
+    """Adds the wall time of a block to an entry of a dictionary."""
+
+    def __init__(self, seconds: dict[str, float], name: str):
+        self.seconds, self.name = seconds, name
+
+    def __enter__(self):
+        self.begin = time.monotonic()
+
+    def __exit__(self, *_):
+        elapsed = time.monotonic() - self.begin
+        self.seconds[self.name] = round(self.seconds.get(self.name, 0.0) + elapsed, 3)
+
+
+def _length_scale(to_world: mi.ScalarTransform4f) -> float:
+    """World units per lattice unit: the cube root of the transform's volume ratio."""
+    return float(abs(np.linalg.det(np.array(to_world.matrix)[:3, :3])) ** (1 / 3))
+
+
+def _plain(config: FitConfig) -> dict:
+    return dataclasses.asdict(config)
+
+
+def _same_config(before: dict, now: dict) -> None:
+    for name, value in now.items():
+        if before.get(name) != value:
+            raise UserError(f"The checkpoint was made with {name} = {before.get(name)}, not {value}; "
+                            f"resume with the same settings or start again with --overwrite.")

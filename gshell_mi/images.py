@@ -1,0 +1,43 @@
+"""Images for people: sRGB, over white, side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """Linear Rec.709 to sRGB (IEC 61966-2-1), clipped to [0, 1].
+
+    >>> float(srgb(np.array(0.5)).round(4))
+    0.7354
+    """
+    linear = np.clip(linear, 0.0, 1.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
+
+
+def over_white(rgba: np.ndarray) -> np.ndarray:
+    """(h, w, 4) linear premultiplied to (h, w, 3) sRGB in front of white."""
+    return srgb(rgba[..., :3] + (1 - rgba[..., 3:]))
+
+
+def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB of arrays with peak 1; 120 dB if they are equal.
+
+    >>> round(psnr(np.zeros(4), np.full(4, 0.1)), 2)
+    20.0
+    """
+    return float(-10 * np.log10(np.mean((image - reference) ** 2) + 1e-12))
+
+
+def triptych(target: np.ndarray, fit: np.ndarray) -> np.ndarray:
+    """Target, fit and 4 x their absolute difference side by side, sRGB; inputs linear RGBA."""
+    left, middle = over_white(target), over_white(fit)
+    return np.concatenate([left, middle, np.clip(4 * np.abs(left - middle), 0, 1)], axis=1)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Writes (h, w, 3) sRGB values in [0, 1]."""
+    Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)).save(path)

@@ -1,0 +1,57 @@
+"""A spatially varying principled material on the lattice."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Range of roughness: below, paths to a small light become too rare for a fit's few samples.
+ROUGHNESS_RANGE = (0.08, 1.0)
+
+#: Vertex attributes of the mesh, and the principled BSDF's parameters that read them.
+ATTRIBUTES = {"vertex_color": "base_color", "vertex_roughness": "roughness", "vertex_metallic": "metallic"}
+
+
+class MaterialField:
+    """Base colour, roughness and metallic at the lattice's vertices, interpolated to the mesh's.
+
+    The field hangs on the lattice, not on the mesh, hence it stays where it is when the surface
+    moves through it, and both sides of a sheet share it.
+
+    Args:
+        base_color: (vertex_count, 3) linear Rec.709 reflectance in [0, 1].
+        roughness, metallic: in [0, 1], uniform to start with.
+
+    The optimised parameters are the logits in ``parameters``, a dictionary of flat ``mi.Float`` by the
+    names of the mesh's attributes; colours are interleaved.
+    """
+
+    def __init__(self, base_color: np.ndarray, roughness: float = 0.6, metallic: float = 0.05):
+        count = len(base_color)
+        low, high = ROUGHNESS_RANGE
+        self.parameters = {
+            "vertex_color": mi.Float(_logit(base_color).astype(np.float32).ravel()),
+            "vertex_roughness": dr.full(mi.Float, float(_logit((roughness - low) / (high - low))), count),
+            "vertex_metallic": dr.full(mi.Float, float(_logit(metallic)), count),
+        }
+
+    def values(self) -> dict[str, mi.Float]:
+        """The lattice fields themselves, all in [0, 1], by attribute name."""
+        unit = {name: dr.rcp(1 + dr.exp(-logits)) for name, logits in self.parameters.items()}
+        low, high = ROUGHNESS_RANGE
+        unit["vertex_roughness"] = low + (high - low) * unit["vertex_roughness"]
+        return unit
+
+
+def principled() -> dict:
+    """A two-sided principled BSDF that reads the mesh's attributes, for ``mi.load_dict``."""
+    textures = {parameter: {"type": "mesh_attribute", "name": attribute}
+                for attribute, parameter in ATTRIBUTES.items()}
+    return {"type": "twosided", "bsdf": {"type": "principled", **textures}}
+
+
+def _logit(x):
+    # Saturated values would have no gradient left.
+    x = np.clip(x, 0.02, 0.98)
+    return np.log(x / (1 - x))

@@ -1,0 +1,134 @@
+"""The fit scene: an ordinary Mitsuba XML file with one gshell shape, the training sensors and their targets."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+
+from .errors import UserError
+from .targets import Target, load_target
+
+#: Samples per pixel of targets rendered from a scene's reference.
+REFERENCE_SPP = 256
+
+
+@dataclass(frozen=True)
+class FitScene:
+    """A loaded fit scene.
+
+    Attributes:
+        path: the XML file.
+        scene: the Mitsuba scene.
+        subject: its gshell shape.
+        light: its emitter ``light`` (``constant`` or ``envmap``).
+        sensors: the training views.
+        targets: their images, in the same order.
+    """
+
+    path: Path
+    scene: mi.Scene
+    subject: mi.Shape
+    light: mi.Emitter
+    sensors: list[mi.Sensor]
+    targets: list[Target]
+
+    @property
+    def name(self) -> str:
+        return self.path.stem
+
+
+def load_fit_scene(path: Path, targets: Path | None = None, *,
+                   on_reference: Callable[[int, int], None] | None = None) -> FitScene:
+    """Loads and checks a fit scene with its targets.
+
+    Args:
+        path: the XML file.
+        targets: folder of ``<sensor id>.exr``; default: the folder beside the XML with its stem.
+        on_reference: called with (views done, views) while missing targets are rendered from
+            ``reference.xml``.
+
+    Raises:
+        UserError: the file is missing or not a Mitsuba scene, it has not exactly one gshell shape, no
+            emitter ``light``, no sensors, sensors of the same id, or a target is missing or unusable.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"Scene '{path}' does not exist; give the path of a fit scene's XML file.")
+    scene = _load(path)
+    subject = _the_subject(scene, path)
+    light = _the_light(scene, path)
+    sensors = scene.sensors()
+    if not sensors:
+        raise UserError(f"Scene '{path}' has no sensors; add a <sensor id=\"view_000\"> per training view.")
+    repeated = [name for name, count in Counter(sensor.id() for sensor in sensors).items() if count > 1]
+    if repeated:
+        raise UserError(f"Scene '{path}' has several sensors with the id '{repeated[0]}'; rename all but one.")
+    folder = Path(targets) if targets else path.with_suffix("")
+    if targets is None:
+        _render_missing_targets(path, folder, sensors, on_reference)
+    loaded = [load_target(folder / f"{sensor.id()}.exr", *sensor.film().crop_size()) for sensor in sensors]
+    if not any(target.rgba[..., 3].any() for target in loaded):
+        raise UserError(f"The targets in '{folder}' show no object: their alpha is 0 everywhere; "
+                        f"write coverage into it.")
+    return FitScene(path, scene, subject, light, sensors, loaded)
+
+
+def _load(path: Path) -> mi.Scene:
+    try:
+        return mi.load_file(str(path))
+    except UserError:
+        raise
+    except Exception as error:
+        reason = str(error).strip().splitlines()
+        raise UserError(f"Scene '{path}' cannot be loaded by Mitsuba: {reason[0] if reason else error!r}") from error
+
+
+def _the_subject(scene: mi.Scene, path: Path) -> mi.Shape:
+    from .shape import GShell
+
+    found = [shape for shape in scene.shapes() if isinstance(shape, GShell)]
+    if len(found) != 1:
+        raise UserError(f"Scene '{path}' has {len(found) or 'no'} gshell shapes; a fit needs exactly one "
+                        f"<shape type=\"gshell\" id=\"subject\">.")
+    return found[0]
+
+
+def _the_light(scene: mi.Scene, path: Path) -> mi.Emitter:
+    found = [emitter for emitter in scene.emitters() if emitter.id() == "light"]
+    if len(found) != 1 or not found[0].is_environment():
+        raise UserError(f"Scene '{path}' has no environment emitter with the id 'light'; add "
+                        f"<emitter type=\"constant\" id=\"light\"/> or an envmap as the initial lighting.")
+    return found[0]
+
+
+def _render_missing_targets(path: Path, folder: Path, sensors: list[mi.Sensor],
+                            progress: Callable[[int, int], None] | None) -> None:
+    """Renders the views that have no target yet, if the scene comes with a reference."""
+    reference = folder / "reference.xml"
+    missing = [sensor for sensor in sensors if not (folder / f"{sensor.id()}.exr").exists()]
+    if not missing or not reference.is_file():
+        return
+    scene = _load(reference)
+    integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
+    for index, sensor in enumerate(missing):
+        if progress:
+            progress(index, len(missing))
+        image = mi.render(scene, sensor=sensor, integrator=integrator, spp=REFERENCE_SPP, seed=index)
+        target = folder / f"{sensor.id()}.exr"
+        # A killed run must not leave half an image behind that the next run takes for a target.
+        partial = target.with_name(f".{target.name}")
+        bitmap = mi.Bitmap(image, mi.Bitmap.PixelFormat.RGBA)
+        try:
+            bitmap.convert(component_format=mi.Struct.Type.Float16).write(str(partial))
+            os.replace(partial, target)
+        except (OSError, RuntimeError) as error:
+            partial.unlink(missing_ok=True)
+            raise UserError(f"Target '{target}' cannot be written ({error}); make the folder writable, "
+                            f"or name another with --targets.") from error
+    if progress:
+        progress(len(missing), len(missing))

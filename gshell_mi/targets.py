@@ -1,0 +1,73 @@
+"""Target images: linear Rec.709 RGBA, colour premultiplied by alpha = coverage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from .errors import UserError
+
+#: Coverage above 1 by more than this is an error; below, rounding of half floats and filter lobes.
+_ALPHA_TOLERANCE = 0.05
+
+
+@dataclass(frozen=True)
+class Target:
+    """One target image.
+
+    Attributes:
+        path: the file it came from.
+        rgba: (height, width, 4) float32, linear, premultiplied by alpha.
+        has_alpha: False if the file had none and 1 was assumed everywhere.
+    """
+
+    path: Path
+    rgba: np.ndarray
+    has_alpha: bool
+
+
+def load_target(path: Path, width: int, height: int) -> Target:
+    """Reads one target and checks that a fit can use it.
+
+    Raises:
+        UserError: the file is missing or unreadable, has another size than its sensor's film, holds
+            NaN or infinity, has negative or excessive coverage, or no RGB channels.
+    """
+    if not path.is_file():
+        raise UserError(
+            f"Target '{path}' is missing; render or copy it there, or name its folder with --targets."
+        )
+    try:
+        bitmap = mi.Bitmap(str(path))
+    except Exception as error:
+        raise UserError(f"Target '{path}' cannot be read as an image ({_first_line(error)}); "
+                        f"write it again as an OpenEXR file.") from error
+    layout = mi.Bitmap.PixelFormat
+    if bitmap.pixel_format() not in (layout.RGB, layout.RGBA):
+        raise UserError(f"Target '{path}' has the channels '{bitmap.pixel_format()}'; "
+                        f"a target needs R, G, B and A (or R, G and B).")
+    if tuple(bitmap.size()) != (width, height):
+        found_width, found_height = bitmap.size()
+        raise UserError(f"Target '{path}' is {found_width} x {found_height} pixels, but its sensor's film is "
+                        f"{width} x {height}; resize one of them.")
+    has_alpha = bitmap.pixel_format() == layout.RGBA
+    pixels = np.array(bitmap.convert(bitmap.pixel_format(), mi.Struct.Type.Float32, False))
+    if not np.isfinite(pixels).all():
+        row, column = np.argwhere(~np.isfinite(pixels).all(axis=-1))[0]
+        raise UserError(f"Target '{path}' holds NaN or infinity (first at column {column}, row {row}); "
+                        f"mend or mask out those pixels.")
+    if not has_alpha:
+        pixels = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
+    alpha = pixels[..., 3]
+    if alpha.min() < -_ALPHA_TOLERANCE or alpha.max() > 1 + _ALPHA_TOLERANCE:
+        raise UserError(f"Target '{path}' has alpha between {alpha.min():.3g} and {alpha.max():.3g}; "
+                        f"alpha is coverage and lies between 0 and 1.")
+    pixels[..., 3] = np.clip(alpha, 0.0, 1.0)
+    return Target(path, pixels, has_alpha)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -1,0 +1,62 @@
+"""Counts that tell whether a mesh is what it should be: loops, components, manifoldness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+#: A boundary loop shorter than this fraction of the bounding box's diagonal is a pin-hole.
+PINHOLE = 0.05
+
+
+@dataclass(frozen=True)
+class Topology:
+    """Counts of a triangle mesh; lengths in the units of its vertices."""
+
+    vertices: int
+    faces: int
+    components: int
+    boundary_loops: int
+    """Closed boundary curves, pin-holes not counted."""
+    pinholes: int
+    """Boundary curves shorter than 5 % of the bounding box's diagonal."""
+    boundary_length: float
+    nonmanifold_edges: int
+    """Edges of more than two faces."""
+
+
+def topology(vertices: np.ndarray, faces: np.ndarray) -> Topology:
+    """Counts of the mesh with (V, 3) ``vertices`` and (F, 3) ``faces``.
+
+    >>> square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    >>> found = topology(square, np.array([[0, 1, 2], [0, 2, 3]]))
+    >>> found.boundary_loops, found.components, found.boundary_length
+    (1, 1, 4.0)
+    """
+    if len(faces) == 0:
+        return Topology(len(vertices), 0, 0, 0, 0, 0.0, 0)
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges, uses = np.unique(edges, axis=0, return_counts=True)
+    boundary = edges[uses == 1]
+    lengths = np.linalg.norm(vertices[boundary[:, 0]] - vertices[boundary[:, 1]], axis=1)
+    used = np.unique(faces)
+    loops = np.array([])
+    if len(boundary):
+        label = vertex_components(boundary, len(vertices))[1]
+        loops = np.bincount(label[boundary[:, 0]], lengths)
+        loops = loops[loops > 0]
+    diagonal = np.linalg.norm(np.ptp(vertices[used], axis=0))
+    pinholes = int((loops <= PINHOLE * diagonal).sum())
+    component = vertex_components(edges, len(vertices))[1]
+    return Topology(len(vertices), len(faces), len(np.unique(component[used])), len(loops) - pinholes, pinholes,
+                    round(float(lengths.sum()), 6), int((uses > 2).sum()))
+
+
+def vertex_components(edges: np.ndarray, vertex_count: int) -> tuple[int, np.ndarray]:
+    """Number of connected components of the graph with (E, 2) ``edges``, and each vertex's component."""
+    weights = np.ones(len(edges), np.int8)
+    graph = coo_matrix((weights, (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
+    return connected_components(graph, directed=False)

@@ -1,0 +1,88 @@
+"""Pinhole geometry of a set of Mitsuba sensors, packed for kernels that mix pixels of all views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .errors import UserError
+
+
+@dataclass(frozen=True)
+class PinholeViews:
+    """Projections of N perspective sensors.
+
+    The direction through the film position ``(u, v)`` in [0, 1]^2 (crop window, v downwards), scaled
+    to depth 1 along the optical axis, is ``basis @ (u, v, 1)``: exact for every sensor whose film
+    is a plane, whatever its field of view, principal point or crop window.
+
+    Attributes:
+        ids: the sensors' ids.
+        sizes: (N, 2) integers, width and height of each crop window in pixels.
+        origins: (N, 3) centres of projection, world units.
+        bases: (N, 3, 3) as above, world units.
+    """
+
+    ids: tuple[str, ...]
+    sizes: np.ndarray
+    origins: np.ndarray
+    bases: np.ndarray
+
+    @classmethod
+    def from_sensors(cls, sensors: list[mi.Sensor]) -> PinholeViews:
+        """Measures the sensors by the rays that they sample.
+
+        Raises:
+            UserError: a sensor is no perspective or thin-lens camera.
+        """
+        sizes, origins, bases = [], [], []
+        for sensor in sensors:
+            parameters = mi.traverse(sensor)
+            if "x_fov" not in parameters:
+                raise UserError(
+                    f"Sensor '{sensor.id()}' is a {sensor.class_name()}, but a fit needs perspective "
+                    f"sensors; use <sensor type=\"perspective\"> or \"thinlens\"."
+                )
+            to_world = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+            forward = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2])
+            film = mi.Point2f([0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
+            ray, _ = sensor.sample_ray_differential(0.0, 0.5, film, mi.Point2f(0.5))
+            corners = np.array(ray.d, dtype=np.float64).T
+            corners /= (corners @ forward)[:, None]
+            bases.append(np.stack([corners[1] - corners[0], corners[2] - corners[0], corners[0]], axis=1))
+            origins.append(to_world[:3, 3])
+            sizes.append(sensor.film().crop_size())
+        return cls(
+            tuple(sensor.id() for sensor in sensors),
+            np.array(sizes, dtype=np.int64),
+            np.array(origins),
+            np.array(bases),
+        )
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @cached_property
+    def _table(self) -> mi.Float:
+        """Four vectors per view on the device: the columns of its basis and its origin."""
+        columns = np.concatenate([self.bases.transpose(0, 2, 1), self.origins[:, None]], axis=1)
+        return mi.Float(columns.ravel())
+
+    def rays(self, view: mi.UInt32, film: mi.Point2f) -> mi.Ray3f:
+        """Rays through film positions ``film`` in [0, 1]^2 of the views with index ``view``."""
+        across, down, corner, origin = (dr.gather(mi.Vector3f, self._table, 4 * view + i) for i in range(4))
+        direction = dr.normalize(across * film.x + down * film.y + corner)
+        return mi.Ray3f(mi.Point3f(origin), direction)
+
+    def project(self, index: int, points: mi.Point3f) -> tuple[mi.Point2f, mi.Float]:
+        """Film positions in [0, 1]^2 and depths (world units along the axis) of points in one view.
+
+        Film positions of points at depth <= 0 have no meaning.
+        """
+        inverse = mi.Matrix3f(np.linalg.inv(self.bases[index]))
+        scaled = inverse @ mi.Vector3f(points - mi.Point3f(self.origins[index]))
+        return mi.Point2f(scaled.x, scaled.y) / scaled.z, scaled.z
