@@ -204,17 +204,36 @@ class _Extraction:
     def candidate_cells(self, s: Any) -> Any:
         """Cells whose corners have different signs, by their lowest vertex, and few others.
 
-        The vertices at the upper borders count as cells too, for the edges that they own. Their corners
-        outside the lattice are wrapped around here and seen to in ``classify``.
+        This is the one pass over the whole field, so the field is read once and packed into one bit per
+        vertex; a neighbour is then a shift in the stream of bits. The vertices at the upper borders count
+        as cells too, for the edges that they own. Their corners outside the lattice are wrapped around
+        here and seen to in ``classify``.
         """
-        vertex = dr.arange(self.uint_t, dr.width(s))
-        last = dr.opaque(self.uint_t, dr.width(s) - 1)
-        inside = s < 0
-        active = dr.mask_t(self.float_t)(False)
+        uint_t = self.uint_t
+        count = dr.width(s)
+        word = dr.arange(uint_t, -(-count // 32))
+        last_vertex, last_word = dr.opaque(uint_t, count - 1), dr.opaque(uint_t, (count - 1) // 32)
+        inside = dr.zeros(uint_t)
+        for bit in range(32):
+            vertex = dr.minimum(word * 32 + bit, last_vertex)
+            inside |= dr.select(dr.gather(self.float_t, s, vertex) < 0, uint_t(1 << bit), 0)
+        dr.eval(inside)
+
+        active = dr.zeros(uint_t)
         for corner in range(1, 8):
-            neighbour = dr.minimum(vertex + self.corner_offset(self.uint_t(corner)), last)
-            active |= (dr.gather(self.float_t, s, neighbour) < 0) != inside
-        return dr.compress(active)
+            offset = self.corner_offset(uint_t(corner))
+            low, shift = word + (offset >> 5), offset & 31
+            first = dr.gather(uint_t, inside, dr.minimum(low, last_word))
+            second = dr.gather(uint_t, inside, dr.minimum(low + 1, last_word))
+            active |= (first >> shift | second << (31 - shift) << 1) ^ inside
+        beyond = ~dr.opaque(uint_t, 0) << (last_vertex & 31) << 1  # bits past the last vertex
+        active &= ~dr.select(word == last_word, beyond, 0)
+
+        words = dr.compress(active != 0)
+        if dr.width(words) == 0:
+            return words
+        owner, bit = _expand(dr.gather(uint_t, active, words), 5)
+        return dr.gather(uint_t, words, owner) * 32 + bit
 
     def classify(self, s: Any, cell: Any) -> tuple[Any, Any, Any]:
         """Per cell: bits of the corners inside, of the differences to crossed edges, of active tets."""
