@@ -28,6 +28,9 @@ from .surface_mesh import CutPoints, EdgePoints, Stencil, SurfaceMesh, concatena
 #: Field values smaller than this count as this, so that gradients of slivers stay below 1e7.
 FIELD_FLOOR = 1e-7
 
+#: Values below this are negative. Not 0: some threads flush denormal numbers to 0 and others do not.
+_NEGATIVE = -(2.0**-126)
+
 _MAX_VERTICES = 1 << 25  # what fits beside 7 edge bits in the 32 bits of a cell's record
 
 
@@ -162,7 +165,7 @@ class _Extraction:
         if msdf is None:
             kept, dropped = a, []
         else:
-            positive = self.edge_points(s, a, b).interpolate(dr.detach(msdf)) >= 0
+            positive = self.edge_points(s, a, b).interpolate(dr.detach(msdf)) >= _NEGATIVE
             kept, dropped = dr.compress(positive), dr.compress(~positive)
         kept_count = dr.width(kept)
         if kept_count == 0 and not with_template:
@@ -216,7 +219,7 @@ class _Extraction:
         inside = dr.zeros(uint_t)
         for bit in range(32):
             vertex = dr.minimum(word * 32 + bit, last_vertex)
-            inside |= dr.select(dr.gather(self.float_t, s, vertex) < 0, uint_t(1 << bit), 0)
+            inside |= dr.select(dr.gather(self.float_t, s, vertex) < _NEGATIVE, uint_t(1 << bit), 0)
         dr.eval(inside)
 
         active = dr.zeros(uint_t)
@@ -244,12 +247,12 @@ class _Extraction:
         border |= dr.select(row - z * self.stride == last, self.uint_t(2), 0)
         border |= dr.select(z == last, self.uint_t(4), 0)
         # A corner outside the lattice takes the sign of the cell's own vertex: no edge there is crossed.
-        own = dr.gather(self.float_t, s, cell) < 0
+        own = dr.gather(self.float_t, s, cell) < _NEGATIVE
         signs = dr.select(own, self.uint_t(1), 0)
         for corner in range(1, 8):
             exists = border & corner == 0
             neighbour = cell + self.corner_offset(self.uint_t(corner))
-            inside = dr.gather(self.float_t, s, neighbour, active=exists) < 0
+            inside = dr.gather(self.float_t, s, neighbour, active=exists) < _NEGATIVE
             signs |= dr.select(dr.select(exists, inside, own), self.uint_t(1 << corner), 0)
         crossed = signs ^ dr.select(own, self.uint_t(255), 0)
         tets = dr.gather(self.uint_t, self.uint_t(tables.active_tets_table()), signs, active=border == 0)
