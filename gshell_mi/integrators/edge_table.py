@@ -130,3 +130,10 @@ def build_edge_table(positions, faces) -> EdgeTable:
     dr.scatter_add(degree, mi.Int32(1), edge, valid)
     dr.eval(start, end, edge, forward, valid, seam, degree)
     return EdgeTable(start, end, edge, forward, valid, seam, degree)
+
+
+def scene_edge_tables(scene):
+    """Pairs of each mesh of the scene that has faces and its :class:`EdgeTable`."""
+    return [(shape, build_edge_table(shape.vertex_positions_buffer(), shape.faces_buffer()))
+            for shape in scene.shapes()
+            if shape.is_mesh() and shape.face_count() > 0 and shape.vertex_count() > 2]

@@ -27,10 +27,10 @@ class FilmSplat:
     u:
         ``Point2f``: sample positions in pixels relative to the crop window.
     values:
-        List of ``Float``: the channels of each sample.
+        List of ``Float``: the channels of each sample, which ``adjoint`` and ``tangent`` need.
     """
 
-    def __init__(self, film, spp, u, values):
+    def __init__(self, film, spp, u, values=()):
         self.u, self.values = dr.detach(u), [dr.detach(v) for v in values]
         self.width, self.height = film.crop_size()
         self.rfilter = film.rfilter()
@@ -103,6 +103,23 @@ class FilmSplat:
                 dr.scatter_add(s, h * v, pixel, inside)
         dr.eval(weight, sums)
         return weight, sums
+
+    def gather(self, image):
+        """Per sample and channel the filtered image value: the adjoint of splatting values."""
+        result = [mi.Float(0) for _ in image]
+        for pixel, inside, h, _, scale in self._taps():
+            for c, channel in enumerate(image):
+                result[c] += h * scale * dr.gather(mi.Float, channel, pixel, inside)
+        return result
+
+    def scatter(self, values):
+        """The image of samples with the given channels."""
+        result = [dr.zeros(mi.Float, self.width * self.height) for _ in values]
+        for pixel, inside, h, _, scale in self._taps():
+            for image, value in zip(result, values, strict=True):
+                dr.scatter_add(image, h * scale * value, pixel, inside)
+        dr.eval(result)
+        return result
 
     def adjoint(self, image_adjoint):
         """Adjoints of the values, of the displacement T(u) - u and of det, for an image adjoint.

@@ -54,6 +54,10 @@ class GShellMaskIntegrator(ADIntegrator):
         normal = dr.select(hit, si.sh_frame.n, 0)
         return PathSample(mi.Spectrum(alpha), alpha, [depth, normal.x, normal.y, normal.z])
 
+    def boundary_terms(self, scene, tables, sensor, seed):
+        """None: the AOVs of the first hit jump at silhouettes only."""
+        return ()
+
     def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
         """See ``GShellPathIntegrator.attached``."""
         now = self.primal(scene, sampler, ray)

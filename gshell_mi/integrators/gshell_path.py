@@ -5,8 +5,12 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from . import reparameterised_film
+from .light_edges import BATCH, sample_directions, shadow_points
 from .path_sample import PathSample
 from .path_vertex import material_point, mis_weight, sample_direct, segment
+
+#: Batches of directions for the shadow boundaries of one render
+LIGHT_BATCHES = 2
 
 
 class GShellPathIntegrator(ADIntegrator):
@@ -17,6 +21,8 @@ class GShellPathIntegrator(ADIntegrator):
         self.hide_emitters = props.get("hide_emitters", False)
         self.warp_radius = props.get("warp_radius", 2.0)
         self.cull_hidden = props.get("cull_hidden", True)
+        self.reparam_depth = props.get("reparam_depth", 2)
+        self.light_edge_samples = props.get("light_edge_samples", 1.0)
 
     # ------------------------------------------------------------------ rendering
 
@@ -42,21 +48,31 @@ class GShellPathIntegrator(ADIntegrator):
         return pi
 
     @dr.syntax
-    def primal(self, scene, sampler, ray, active=True):
-        """Radiance and coverage along camera rays, without derivatives."""
+    def primal(self, scene, sampler, ray, active=True, start=0):
+        """Radiance and coverage along camera rays, without derivatives.
+
+        With ``start`` = 1 the rays are those of a second segment instead: the light that arrives
+        along them other than from area lights.
+        """
         ray = mi.Ray3f(dr.detach(ray))
-        depth = mi.UInt32(0)
+        depth = mi.UInt32(start)
         L, beta, eta = mi.Spectrum(0), mi.Spectrum(1), mi.Float(1)
         active = mi.Bool(active)
         covered = mi.Bool(not self.hide_emitters and scene.environment() is not None)
-        pi = self._first_hit(scene, ray, active)
+        if dr.hint(start == 0, mode="scalar"):
+            pi = self._first_hit(scene, ray, active)
+        else:
+            pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         si_prev = dr.zeros(mi.SurfaceInteraction3f)
         pdf_prev, delta_prev = mi.Float(1), mi.Bool(True)
 
-        while dr.hint(active, max_iterations=self.max_depth, label="gshell_path (primal)"):
+        while dr.hint(active, max_iterations=self.max_depth - start, label="gshell_path (primal)"):
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
             bsdf = si.bsdf(ray)
-            L += beta * self._emission(scene, si, si_prev, pdf_prev, delta_prev, depth, active)
+            shines = active
+            if dr.hint(start > 0, mode="scalar"):
+                shines = active & ~((depth == start) & si.is_valid())
+            L += beta * self._emission(scene, si, si_prev, pdf_prev, delta_prev, depth, shines)
             active_next = active & (depth + 1 < self.max_depth) & si.is_valid()
             L += beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, False, False)
             sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(),
@@ -89,6 +105,43 @@ class GShellPathIntegrator(ADIntegrator):
         go_on = sampler.next_1d() < survive
         beta = dr.select(play, beta * dr.rcp(survive), beta)
         return beta, active & (peak != 0) & (~play | go_on)
+
+    # ------------------------------------------------------------------ shadows
+
+    def boundary_terms(self, scene, tables, sensor, seed):
+        """Yields the :class:`BoundaryTerm` of what the first visible surface receives."""
+        if self.reparam_depth < 2 or self.max_depth < 2:
+            return
+        film = sensor.film()
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed, BATCH)
+        per_mesh = dr.prod(film.crop_size()) * self.light_edge_samples / (LIGHT_BATCHES * max(len(tables), 1))
+        for _ in range(LIGHT_BATCHES):
+            sources = sample_directions(scene, sampler)
+            for mesh, table in tables:
+                term = shadow_points(scene, sensor, mesh, table, sources, max(int(per_mesh), 1), sampler)
+                if term is None:
+                    continue
+                direction = dr.gather(mi.Vector3f, dr.ravel(sources.position), term.source)
+                path_sampler = sampler.clone()
+                path_sampler.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)),
+                                  dr.width(term.source))
+                left, right = (self._reflected(scene, sensor, u, direction, path_sampler.clone())
+                               for u in term.sides())
+                term.jump = reparameterised_film.film_channels(film, left - right, mi.Float(0), [],
+                                                               mi.Color0f())
+                dr.eval(term.jump)
+                yield term
+
+    def _reflected(self, scene, sensor, u, direction, sampler):
+        """Light from one direction that the surface seen at a film position reflects."""
+        position = u / mi.Vector2f(sensor.film().crop_size())
+        ray, weight = sensor.sample_ray(sensor.shutter_open(), 0.0, position, mi.Point2f(0.5))
+        si = self._first_hit(scene, ray).compute_surface_interaction(ray, mi.RayFlags.All)
+        value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), si.is_valid())
+        seen = si.is_valid() & (dr.max(mi.unpolarized_spectrum(value)) > 0)
+        arriving = self.primal(scene, sampler, si.spawn_ray(direction), seen, start=1)
+        return dr.select(seen, weight * value * arriving.value, 0)
 
     def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
         """Derivatives of camera paths.

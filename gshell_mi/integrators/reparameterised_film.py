@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import UserError
+from .edge_table import scene_edge_tables
 from .film_splat import FilmSplat
 from .silhouette_edges import screen_edges
 from .warp import EdgeGrid, FilmWarp, fixed_line_weight
@@ -106,27 +107,42 @@ def _develop_adjoint(film, image_adjoint, count, aov_names):
     return result
 
 
-def _warped(scene, sensor, samples, integrator):
-    """T(u) and det T(u), attached."""
-    film = sensor.film()
-    u = samples.u
-    edges = screen_edges(scene, sensor, integrator.warp_radius + 2 + max(-samples.origin[0], 0),
-                         cull=integrator.cull_hidden)
-    if edges is None or not (dr.grad_enabled(edges.a) or dr.grad_enabled(edges.b)):
-        return mi.Point2f(u), mi.Float(1)
-    fixed, grad_fixed = mi.Float(0), mi.Vector2f(0)
-    if film.rfilter().is_box_filter():
-        cell = dr.floor(u)
-        fixed, grad_fixed = fixed_line_weight(u, [(k, cell[k] + s) for k in (0, 1) for s in (0, 1)], 0.5)
-    elif not film.sample_border():
-        size = mi.Point2f(film.crop_size())
-        lines = [(k, edge) for k in (0, 1) for edge in (mi.Float(0), size[k])]
-        fixed, grad_fixed = fixed_line_weight(u, lines, integrator.warp_radius)
-    grid = EdgeGrid(edges.a, edges.b, integrator.warp_radius, samples.origin, samples.size)
-    dr.eval(fixed, grad_fixed)
-    with dr.resume_grad():
-        velocity, divergence = dr.custom(FilmWarp, edges.a, edges.b, grid, u, fixed, grad_fixed)
-        return u + velocity, 1 + divergence
+class Warp:
+    """The warp T of the film that follows the silhouettes of a scene's meshes."""
+
+    def __init__(self, scene, tables, sensor, samples, integrator):
+        self.film, self.radius = sensor.film(), integrator.warp_radius
+        margin = self.radius + 2 - samples.origin[0]
+        self.edges = screen_edges(scene, tables, sensor, margin, cull=integrator.cull_hidden)
+        self.grid = None
+        with dr.resume_grad():
+            moving = self.edges is not None and dr.grad_enabled((self.edges.a, self.edges.b))
+        if moving:
+            self.grid = EdgeGrid(self.edges.a, self.edges.b, self.radius, samples.origin, samples.size)
+
+    def __call__(self, u):
+        """T(u) and det T(u), attached, for positions in pixels relative to the crop window."""
+        u = mi.Point2f(dr.detach(u))
+        if self.grid is None:
+            return u, mi.Float(1)
+        fixed, grad_fixed = self._fixed_lines(u)
+        dr.eval(u, fixed, grad_fixed)
+        with dr.resume_grad():
+            velocity, divergence = dr.custom(FilmWarp, self.edges.a, self.edges.b, self.grid, u, fixed,
+                                             grad_fixed)
+            return u + velocity, 1 + divergence
+
+    def _fixed_lines(self, u):
+        """T must keep what the filter or the frame cuts off: their lines do not move."""
+        if self.film.rfilter().is_box_filter():
+            cell = dr.floor(u)
+            lines = [(k, cell[k] + side) for k in (0, 1) for side in (0, 1)]
+            return fixed_line_weight(u, lines, 0.5)
+        if not self.film.sample_border():
+            size = mi.Point2f(self.film.crop_size())
+            return fixed_line_weight(u, [(k, x) for k in (0, 1) for x in (mi.Float(0), size[k])],
+                                     self.radius)
+        return mi.Float(0), mi.Vector2f(0)
 
 
 def _prepare(integrator, scene, sensor, seed, spp):
@@ -156,8 +172,15 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
         image_adjoint = _develop_adjoint(film, grad_in, len(values), integrator.aov_names())
         on_values, on_shift, on_det = FilmSplat(film, spp, samples.u, values).adjoint(image_adjoint)
         dr.eval(on_values, on_shift, on_det)
+        tables = scene_edge_tables(scene)
+        warp = Warp(scene, tables, sensor, samples, integrator)
+        for term in integrator.boundary_terms(scene, tables, sensor, seed):
+            on_jump = FilmSplat(film, 1, term.film).gather(image_adjoint)
+            jump = sum(x * d for x, d in zip(term.jump, on_jump, strict=True))
+            with dr.resume_grad():
+                dr.backward_from(dr.detach(jump) * term.swept(warp))
         with dr.resume_grad():
-            shifted, det = _warped(scene, sensor, samples, integrator)
+            shifted, det = warp(samples.u)
             ray, weight = samples.rays(sensor, shifted)
 
             def on_sample(value, alpha, aovs):
@@ -176,8 +199,18 @@ def render_forward(integrator, scene, sensor, seed, spp):
         sensor, sampler, spp, samples = _prepare(integrator, scene, sensor, seed, spp)
         film = sensor.film()
         state, values = _primal(integrator, scene, sensor, sampler, samples)
+        tables = scene_edge_tables(scene)
+        warp = Warp(scene, tables, sensor, samples, integrator)
+        image = [dr.zeros(mi.Float, 1) for _ in values]
+        for term in integrator.boundary_terms(scene, tables, sensor, seed):
+            with dr.resume_grad():
+                swept = term.swept(warp)
+                dr.forward_to(swept, flags=dr.ADFlag.ClearEdges)
+                swept = dr.grad(swept)
+            terms = FilmSplat(film, 1, term.film).scatter([x * swept for x in term.jump])
+            image = [a + b for a, b in zip(image, terms, strict=True)]
         with dr.resume_grad():
-            shifted, det = _warped(scene, sensor, samples, integrator)
+            shifted, det = warp(samples.u)
             ray, weight = samples.rays(sensor, shifted)
 
             def on_sample(value, alpha, aovs):
@@ -186,5 +219,6 @@ def render_forward(integrator, scene, sensor, seed, spp):
             tangents, (shift, divergence) = integrator.attached(
                 dr.ADMode.Forward, scene, sampler, ray, state, on_sample, (shifted, det))
         dr.eval(tangents, shift, divergence)
-        image = FilmSplat(film, spp, samples.u, values).tangent(tangents, shift, divergence)
+        terms = FilmSplat(film, spp, samples.u, values).tangent(tangents, shift, divergence)
+        image = [a + b for a, b in zip(image, terms, strict=True)]
         return _develop(film, image, integrator.aov_names())

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .edge_table import build_edge_table
-
 
 @dataclass
 class ScreenEdges:
@@ -22,24 +20,25 @@ class ScreenEdges:
         return dr.width(self.a)
 
 
-def silhouette_mask(positions, faces, viewpoint):
+def silhouette_mask(positions, faces, table, viewpoint):
     """Which directed edges carry the silhouette seen from a point.
 
     An edge carries it when all its faces lie on one side of the plane through the edge and the
     viewpoint: open edges always do, and edges between a face turned to the viewpoint and one turned
     away. The test does not depend on how the faces are oriented.
 
-    Returns the :class:`~gshell_mi.integrators.edge_table.EdgeTable` and a ``Bool`` of width 3F, true
-    at the representative of each such edge.
+    Returns a ``Bool`` of width 3F, true at the representative of each such edge of the
+    :class:`~gshell_mi.integrators.edge_table.EdgeTable`.
 
+    >>> from gshell_mi.integrators.edge_table import build_edge_table
     >>> tet = mi.Float(0, 0, 0,  1, 0, 0,  0, 1, 0,  0, 0, 1)
     >>> faces = mi.UInt32(0, 2, 1,  0, 1, 3,  0, 3, 2,  1, 2, 3)
-    >>> dr.count(silhouette_mask(tet, faces, mi.Point3f(0.2, 0.2, -5))[1])
+    >>> table = build_edge_table(tet, faces)
+    >>> dr.count(silhouette_mask(tet, faces, table, mi.Point3f(0.2, 0.2, -5)))
     3
-    >>> dr.count(silhouette_mask(tet, faces, mi.Point3f(5, -4, -5))[1])
+    >>> dr.count(silhouette_mask(tet, faces, table, mi.Point3f(5, -4, -5)))
     4
     """
-    table = build_edge_table(positions, faces)
     n = dr.width(faces)
     positions = dr.detach(positions)
     face = dr.arange(mi.UInt32, n) // 3
@@ -50,7 +49,7 @@ def silhouette_mask(positions, faces, viewpoint):
     sides = dr.zeros(mi.Int32, n)
     dr.scatter_add(sides, side, table.edge, table.valid)
     dr.eval(sides)
-    return table, (table.degree > 0) & (dr.abs(sides) == table.degree)
+    return (table.degree > 0) & (dr.abs(sides) == table.degree)
 
 
 def _clip(lo, hi, inside_a, inside_b):
@@ -72,13 +71,11 @@ def _compact(selected, *arrays):
     return [dr.gather(type(x), x, index) for x in arrays]
 
 
-def _mesh_pieces(mesh, sensor, margin, piece_length, to_camera, near):
+def _mesh_pieces(mesh, table, sensor, margin, piece_length, to_camera, near):
     """The silhouette of one mesh in pieces: vertices of the edge, and the interval of it they span."""
     positions, faces = dr.detach(mesh.vertex_positions_buffer()), mesh.faces_buffer()
-    if dr.width(faces) < 3 or dr.width(positions) < 9:
-        return None
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
-    table, selected = silhouette_mask(positions, faces, viewpoint)
+    selected = silhouette_mask(positions, faces, table, viewpoint)
     start, end = _compact(selected, table.start, table.end)
     if dr.width(start) == 0:
         return None
@@ -142,13 +139,15 @@ def _seen(scene, viewpoint, p, q):
     return seen
 
 
-def screen_edges(scene, sensor, margin, *, piece_length=4.0, cull=True):
+def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True):
     """All silhouettes of the scene's meshes, projected and cut into short pieces.
 
     Parameters
     ----------
     scene, sensor:
         The scene, and a perspective sensor.
+    tables:
+        What :func:`~gshell_mi.integrators.edge_table.scene_edge_tables` gives for the scene.
     margin:
         Width in pixels of the band around the crop window from which edges are kept.
     piece_length:
@@ -164,16 +163,13 @@ def screen_edges(scene, sensor, margin, *, piece_length=4.0, cull=True):
     near = max(sensor.near_clip(), 1e-6)
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
     parts = []
-    for shape in scene.shapes():
-        if not shape.is_mesh():
-            continue
-        pieces = _mesh_pieces(shape, sensor, margin, piece_length, to_camera, near)
+    for shape, table in tables:
+        pieces = _mesh_pieces(shape, table, sensor, margin, piece_length, to_camera, near)
         if pieces is None:
             continue
-        positions = shape.vertex_positions_buffer()
         start, end, lo, hi = pieces
         if cull:
-            flat = dr.detach(positions)
+            flat = dr.detach(shape.vertex_positions_buffer())
             p, q = dr.gather(mi.Point3f, flat, start), dr.gather(mi.Point3f, flat, end)
             seen = _seen(scene, viewpoint, dr.lerp(p, q, lo), dr.lerp(p, q, hi))
             dr.eval(seen, start, end, lo, hi)
@@ -182,6 +178,7 @@ def screen_edges(scene, sensor, margin, *, piece_length=4.0, cull=True):
                 continue
         dr.eval(start, end, lo, hi)
         with dr.resume_grad():
+            positions = shape.vertex_positions_buffer()
             p, q = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
             parts.append((project_to_film(sensor, dr.lerp(p, q, lo)),
                           project_to_film(sensor, dr.lerp(p, q, hi))))

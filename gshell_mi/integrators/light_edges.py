@@ -1,0 +1,244 @@
+"""The derivative of what the first visible surface receives, where edges cut it off.
+
+For a fixed direction ``ω`` (or a fixed point ``z`` of an area light) the reflected light
+``F(u) = f(x(u), ω) L(x(u), ω)`` is a function on the film. It jumps along the curve on which the
+silhouette edges for ``ω`` cast their shadow on what the camera sees. By Reynolds' theorem those
+curves add
+
+    sum over edges, integral over t of  h(c) (F_- - F_+) cross(dc/dt, dc/dθ)
+
+to the derivative of a pixel with filter ``h``, where ``c(t, θ)`` is the film position of the shadow
+of the edge point ``t``. Writing the boundary term on the film needs no further Jacobians: ``c`` is
+an edge point, projected along ``ω`` on the receiver and from there on the film, all attached.
+
+A batch of 32 directions or points shares the search for silhouette edges: which side each lies on is
+one bit per face, and an edge carries the silhouette where the bits of its faces agree.
+"""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .silhouette_edges import project_to_film
+
+BATCH = 32
+
+
+@dataclass
+class LightSources:
+    """A batch of 32 sampled directions, or points on emitters."""
+
+    position: object    #: ``Vector3f``, 32: unit direction, or point in world space
+    is_point: bool      #: which of the two
+    weight: object      #: ``Float``, 32: one over the number of samples and their density
+    importance: object  #: ``Float``, 32: how densely to sample edges, relative to each other
+    emitted: object     #: ``DirectionSample3f``, 32, for points on emitters, else ``None``
+
+
+def sample_directions(scene, sampler):
+    """Half of the directions from the environment's density, half uniform over the sphere."""
+    it = dr.zeros(mi.Interaction3f, BATCH)
+    box = scene.bbox()
+    it.p = mi.Point3f(box.center()) if box.valid() else mi.Point3f(0)
+    sample = sampler.next_2d()
+    stratum = dr.arange(mi.UInt32, BATCH)
+    uniform = mi.warp.square_to_uniform_sphere(
+        mi.Point2f((mi.Float(stratum) + sample.x) / BATCH, sample.y))
+    environment = scene.environment()
+    if environment is None:
+        return LightSources(mi.Vector3f(uniform), False, mi.Float(4 * dr.pi / BATCH),
+                            dr.ones(mi.Float, BATCH), None)
+    ds, _ = environment.sample_direction(it, sampler.next_2d())
+    direction = dr.select(stratum < BATCH // 2, ds.d, uniform)
+    ds.d = direction
+    density = 0.5 * environment.pdf_direction(it, ds) + 0.5 / (4 * dr.pi)
+    si = dr.zeros(mi.SurfaceInteraction3f, BATCH)
+    si.wi = -direction
+    radiance = dr.mean(mi.unpolarized_spectrum(environment.eval(si)))
+    weight = 1 / (BATCH * density)
+    radiance = dr.maximum(radiance, 0.1 * dr.mean(radiance * weight) / (4 * dr.pi) * BATCH)
+    dr.eval(direction, weight, radiance)
+    return LightSources(direction, False, weight, radiance * weight, None)
+
+
+def _silhouette_bits(mesh, table, sources):
+    """Per directed edge, for which sources it carries the silhouette, one bit each."""
+    positions, faces = dr.detach(mesh.vertex_positions_buffer()), mesh.faces_buffer()
+    n = dr.width(faces) // 3
+    face = dr.arange(mi.UInt32, n)
+    p0, p1, p2 = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k))
+                  for k in range(3))
+    normal = dr.cross(p1 - p0, p2 - p0)
+    flat = dr.ravel(sources.position)
+    dr.eval(flat)
+    bits = mi.UInt32(0)
+    for j in range(BATCH):
+        z = dr.gather(mi.Vector3f, flat, mi.UInt32(j))
+        height = dr.dot(normal, z - p0 if sources.is_point else z)
+        bits |= dr.select(height > 0, mi.UInt32(1 << j), 0)
+    dr.eval(bits)
+    side = dr.gather(mi.UInt32, bits, dr.arange(mi.UInt32, 3 * n) // 3)
+    side = dr.select(table.forward, side, ~side)
+    everywhere = dr.full(mi.UInt32, 0xFFFFFFFF, 3 * n)
+    above, below = everywhere, dr.full(mi.UInt32, 0xFFFFFFFF, 3 * n)
+    dr.scatter_reduce(dr.ReduceOp.And, above, side, table.edge, table.valid)
+    dr.scatter_reduce(dr.ReduceOp.And, below, ~side, table.edge, table.valid)
+    return dr.select(table.degree > 0, above | below, 0)
+
+
+def _expand(count):
+    """For counts per item, the item of each of the ``sum(count)`` entries and its number there."""
+    item = dr.compress(count > 0)
+    count = dr.gather(mi.UInt32, count, item)
+    first = dr.prefix_sum(count)
+    total = dr.sum(count)[0]
+    mark = dr.zeros(mi.UInt32, max(total, 1))
+    dr.scatter(mark, mi.UInt32(1), first, mode=dr.ReduceMode.Permute)
+    run = dr.cumsum(mark) - 1
+    entry = dr.gather(mi.UInt32, item, run, total > 0)
+    number = dr.arange(mi.UInt32, max(total, 1)) - dr.gather(mi.UInt32, first, run, total > 0)
+    dr.eval(entry, number)
+    return entry, number, total
+
+
+def _sample_edges(mesh, table, sources, samples, sampler):
+    """Silhouette edges of a mesh, drawn in proportion to their apparent length and importance.
+
+    Returns end point indices, source index and weight of each sample, or ``None``.
+    """
+    bits = _silhouette_bits(mesh, table, sources)
+    edge, number, total = _expand(dr.popcnt(bits))
+    if total == 0:
+        return None
+    # The number-th set bit
+    word = dr.gather(mi.UInt32, bits, edge)
+    source = mi.UInt32(0)
+    for j in range(BATCH):
+        is_set = (word >> j) & 1
+        source = dr.select((is_set == 1) & (number == 0), j, source)
+        number = dr.select(is_set == 1, number - 1, number)
+    dr.eval(source)
+    start, end = dr.gather(mi.UInt32, table.start, edge), dr.gather(mi.UInt32, table.end, edge)
+    positions = dr.detach(mesh.vertex_positions_buffer())
+    p, q = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
+    towards = dr.gather(mi.Vector3f, dr.ravel(sources.position), source)
+    if sources.is_point:
+        towards = dr.normalize(towards - 0.5 * (p + q))
+    importance = dr.norm(dr.cross(q - p, towards)) * dr.gather(mi.Float, sources.importance, source)
+    importance = dr.select(dr.isfinite(importance), importance, 0)
+
+    # Systematic resampling: one uniform number for all samples
+    cumulative = dr.cumsum(mi.Float64(importance))
+    dr.eval(start, end, source, importance, cumulative)
+    mass = dr.gather(mi.Float64, cumulative, mi.UInt32(dr.width(cumulative) - 1))
+    offset = mi.Float64(sampler.next_1d()[0])
+    scaled = dr.minimum(cumulative / mass, 1) * samples + dr.opaque(mi.Float64, offset[0])
+    upper = mi.UInt32(dr.floor(scaled))
+    index = dr.arange(mi.UInt32, dr.width(upper))
+    lower = dr.gather(mi.UInt32, upper, index - 1, index > 0)
+    dr.eval(upper)
+    chosen, _, total = _expand(upper - lower)
+    if total == 0 or not dr.all(dr.isfinite(mass))[0]:
+        return None
+    start, end, source = (dr.gather(mi.UInt32, x, chosen) for x in (start, end, source))
+    weight = mi.Float(mass / samples) / dr.gather(mi.Float, importance, chosen)
+    weight *= dr.gather(mi.Float, sources.weight, source)
+    dr.eval(start, end, source, weight)
+    return start, end, source, weight
+
+
+@dataclass
+class BoundaryTerm:
+    """Points on curves of the film at which the integrand jumps."""
+
+    moving: object      #: ``Point2f``, attached: position in pixels relative to the crop window
+    tangent: object     #: ``Vector2f``: its derivative along the edge
+    source: object      #: ``UInt32``: which light sample casts the shadow
+    weight: object      #: ``Float``
+    jump: object = None     #: per film channel, the value on the left of the tangent less the other
+
+    @property
+    def film(self):
+        """The present position."""
+        return dr.detach(self.moving)
+
+    def sides(self, distance=0.02):
+        """Film positions on either side of the curve."""
+        normal = mi.Vector2f(-self.tangent.y, self.tangent.x) * (distance / dr.norm(self.tangent))
+        return self.film + normal, self.film - normal
+
+    def swept(self, warp):
+        """Weighted area that the curve sweeps over the film, relative to the warp; attached."""
+        shifted, _ = warp(self.film)
+        motion = mi.Vector2f(self.moving - shifted)
+        return self.weight * (self.tangent.y * motion.x - self.tangent.x * motion.y)
+
+
+def shadow_points(scene, sensor, mesh, table, sources, samples, sampler):
+    """Draws points on the shadow boundaries that a mesh casts; ``None`` if none is seen."""
+    film = sensor.film()
+    drawn = _sample_edges(mesh, table, sources, samples, sampler)
+    if drawn is None:
+        return None
+    start, end, source, weight = drawn
+    flat = dr.detach(mesh.vertex_positions_buffer())
+    n = dr.width(start)
+    edge_sampler = sampler.clone()
+    edge_sampler.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)), n)
+    t = edge_sampler.next_1d()
+    light = dr.ravel(sources.position)
+
+    def edge_and_direction(buffer, start, end, t, source):
+        p, q = dr.gather(mi.Point3f, buffer, start), dr.gather(mi.Point3f, buffer, end)
+        y = dr.lerp(p, q, t)
+        z = dr.gather(mi.Vector3f, light, source)
+        return q - p, y, dr.normalize(z - y) if sources.is_point else z
+
+    _, y, towards = edge_and_direction(flat, start, end, t, source)
+    lift = 1e-4 * (1 + dr.max(dr.abs(y)))
+    pi = scene.ray_intersect_preliminary(mi.Ray3f(y - towards * lift, -towards))
+    p = y - towards * (lift + pi.t)
+    # The camera has to see the shadow, and the film to cover it.
+    viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
+    offset = p - viewpoint
+    distance = dr.norm(offset)
+    to_camera = dr.detach(sensor.world_transform()).inverse()
+    ahead = pi.is_valid() & ((to_camera @ p).z > sensor.near_clip())
+    blocked = scene.ray_test(mi.Ray3f(viewpoint, offset / distance, distance * (1 - 1e-3), 0.0,
+                                      mi.Color0f()), ahead)
+    c = project_to_film(sensor, p)
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    size = mi.Point2f(film.crop_size())
+    seen = ahead & ~blocked & dr.all((c > -border) & (c < size + border))
+    dr.eval(seen, t)
+    kept = dr.compress(seen)
+    if dr.width(kept) == 0:
+        return None
+    start, end, source = (dr.gather(mi.UInt32, x, kept) for x in (start, end, source))
+    t, weight = dr.gather(mi.Float, t, kept), dr.gather(mi.Float, weight, kept)
+    dr.eval(start, end, source, t, weight)
+
+    with dr.resume_grad():
+        edge, y, towards = edge_and_direction(mesh.vertex_positions_buffer(), start, end, t, source)
+        lift = 1e-4 * (1 + dr.max(dr.abs(dr.detach(y))))
+        ray = mi.Ray3f(y - towards * lift, -towards)
+        with dr.suspend_grad():
+            pi = scene.ray_intersect_preliminary(dr.detach(ray))
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+        film_position = project_to_film(sensor, si.p)
+    # Along the edge, the shadow moves by the edge vector projected along the light on the receiver.
+    edge, normal, towards = dr.detach(edge), dr.detach(si.n), dr.detach(towards)
+    if sources.is_point:
+        z = mi.Point3f(dr.gather(mi.Vector3f, light, source))
+        edge *= dr.norm(dr.detach(si.p) - z) / dr.norm(dr.detach(y) - z)
+    slide = edge - towards * (dr.dot(normal, edge) / dr.dot(normal, towards))
+    step = 1e-3 * dr.norm(dr.detach(si.p) - viewpoint) / dr.maximum(dr.norm(slide), 1e-20)
+    with dr.suspend_grad():
+        there = project_to_film(sensor, dr.detach(si.p) + slide * step)
+        here = project_to_film(sensor, dr.detach(si.p) - slide * step)
+    tangent = mi.Vector2f(there - here) / (2 * step)
+    usable = pi.is_valid() & dr.isfinite(dr.squared_norm(tangent)) & (dr.squared_norm(tangent) > 0)
+    weight = dr.select(usable, weight, 0)
+    tangent = dr.select(usable, tangent, mi.Vector2f(1, 0))
+    return BoundaryTerm(film_position, tangent, source, weight)
