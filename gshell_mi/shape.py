@@ -73,12 +73,9 @@ class GShell(mi.Mesh):
         smooth = not props.get("face_normals", False)
         self.to_world = compat.to_world(props)
         compat.init_mesh(self, props, has_vertex_normals=smooth)
-        fields = _initial_fields(filename, resolution, self.to_world)
-        self.lattice = fields.lattice
-        self.sdf, self.msdf, self.deform = (mi.Float(getattr(fields, name)) for name in _FIELDS)
         self._attributes: dict[str, tuple[Any, int]] = {}
         self._mirrored = bool(np.linalg.det(np.array(self.to_world.matrix)[:3, :3]) < 0)
-        self._extract()
+        self.set_fields(_initial_fields(filename, resolution, self.to_world))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         differentiable = mi.ParamFlags.Differentiable
@@ -122,6 +119,19 @@ class GShell(mi.Mesh):
             self.remove_attribute(name)
         self.add_attribute(name, channels, dr.zeros(mi.Float, channels * self.vertex_count()))
         self._write()
+
+    def set_fields(self, fields: LatticeFields) -> None:
+        """Replaces the lattice and all its fields, at any resolution; attached attributes are dropped.
+
+        The parameters of an earlier ``mi.traverse`` are stale then, and a scene that holds the shape has to
+        be told by ``scene.parameters_changed()``.
+        """
+        for name in self._attributes:
+            self.remove_attribute(name)
+        self._attributes = {}
+        self.lattice = fields.lattice
+        self.sdf, self.msdf, self.deform = (mi.Float(getattr(fields, name)) for name in _FIELDS)
+        self._extract()
 
     def template(self) -> SurfaceMesh:
         """The watertight template of the present fields, in world space."""

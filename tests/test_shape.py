@@ -223,6 +223,18 @@ def test_template():
     assert not subject.surface.to_trimesh().is_watertight
 
 
+def test_set_fields_changes_the_resolution():
+    scene = _scene()
+    subject = _subject(scene)
+    subject.attach_attribute("vertex_color", dr.zeros(mi.Float, 3 * subject.lattice.vertex_count))
+    subject.set_fields(sphere(TetLattice(24), 0.8))
+    scene.parameters_changed()
+    assert _depth(scene)[0] == pytest.approx(3.2, abs=0.01)
+    params = mi.traverse(scene)
+    assert dr.width(params["subject.sdf"]) == 25**3
+    assert not any("vertex_color" in key for key in params.keys())
+
+
 def test_fields_from_a_file(tmp_path):
     path = tmp_path / "fields.npz"
     ball = sphere(TetLattice(10), 0.8)
