@@ -68,7 +68,7 @@ class GShell(mi.Mesh):
         grid = props.get("grid", "tet")
         if grid != "tet":
             raise UserError(f"gshell: grid '{grid}' is not available, only 'tet' is")
-        resolution = int(props.get("resolution", 0))
+        resolution = int(props["resolution"]) if "resolution" in props else None
         filename = props.get("filename", "")
         smooth = not props.get("face_normals", False)
         self.to_world = compat.to_world(props)
@@ -195,14 +195,15 @@ class _Padding:
         return dr.select(exists, padded, 0) if fill_with_zero else padded
 
 
-def _initial_fields(filename: str, resolution: int, to_world: Any) -> LatticeFields:
+def _initial_fields(filename: str, resolution: int | None, to_world: Any) -> LatticeFields:
+    lattice = TetLattice(64 if resolution is None else resolution)
     if not filename:
-        return sphere(TetLattice(resolution or 64))
+        return sphere(lattice)
     path = mi.file_resolver().resolve(filename)
     if not str(path).endswith(".npz"):
-        return from_mesh(str(path), TetLattice(resolution or 64), to_world=np.array(to_world.matrix))
+        return from_mesh(str(path), lattice, to_world=np.array(to_world.matrix))
     fields = LatticeFields.load(str(path))
-    if resolution and fields.lattice.resolution != resolution:
+    if resolution not in (None, fields.lattice.resolution):
         raise UserError(
             f"{path}: holds fields of resolution {fields.lattice.resolution}, but the shape asks for "
             f"{resolution}; leave 'resolution' out or change it"

@@ -252,6 +252,16 @@ def test_other_grids_are_refused(grid):
         _scene(grid=grid)
 
 
+def test_bad_resolution():
+    with pytest.raises(RuntimeError, match="between 1 and 800 cells per side, not 0"):
+        _scene(resolution=0)
+
+
+def test_missing_file():
+    with pytest.raises(RuntimeError, match=r"nowhere.npz: cannot be read as an .npz archive"):
+        _scene(filename="nowhere.npz")
+
+
 def test_nan_names_the_field():
     scene = _scene()
     params = mi.traverse(scene)

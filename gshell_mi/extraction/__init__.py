@@ -1,6 +1,6 @@
 """From fields on a lattice to triangle meshes."""
 
+from .extract import extract
 from .surface_mesh import SurfaceMesh
-from .tetrahedra import extract
 
 __all__ = ["SurfaceMesh", "extract"]

@@ -34,64 +34,6 @@ _NEGATIVE = -(2.0**-126)
 _MAX_VERTICES = 1 << 25  # what fits beside 7 edge bits in the 32 bits of a cell's record
 
 
-def extract(
-    lattice: TetLattice, sdf: Any, msdf: Any = None, deform: Any = None, *, template: bool = False
-) -> SurfaceMesh:
-    """The surface ``{sdf = 0, msdf >= 0}`` as a triangle mesh, differentiable in all three fields.
-
-    A vertex is inside where ``sdf < 0``; faces point outwards. Where a field crosses 0 very close to a
-    lattice vertex (or is exactly 0 there) the mesh vertex is kept a small fraction of the edge away, so
-    that no triangle degenerates; derivatives are those of the formula at the shifted point. The surface
-    ends in an open boundary where it leaves the lattice: a field that is positive on the border of the
-    lattice has a watertight template.
-
-    Args:
-        lattice: the lattice of n vertices; its docstring gives their order.
-        sdf: signed distance in lattice units, Dr.Jit ``Float`` or tensor of n values. Its type decides
-            the backend that everything is computed on.
-        msdf: manifold signed distance (n values); None keeps the whole template.
-        deform: offsets of the lattice vertices as ``Array3f`` of n or flat ``Float`` of 3 n values
-            (x0, y0, z0, x1, ...), clipped to [-1, 1], where 1 is ``lattice.max_offset``; None for none.
-        template: also return the watertight template as ``SurfaceMesh.template``.
-
-    Raises:
-        UserError: a field has a wrong size or holds NaN or infinity; the sentence names it.
-
-    >>> import drjit as dr, drjit.llvm.ad as d
-    >>> lattice = TetLattice(16)
-    >>> p = lattice.points(d.Float)
-    >>> ball = extract(lattice, dr.norm(p) - 0.5)
-    >>> ball.to_trimesh().is_watertight, ball.to_trimesh().euler_number
-    (True, 2)
-    >>> bowl = extract(lattice, dr.norm(p) - 0.5, -p.z)  # the half z <= 0
-    >>> bowl.to_trimesh().euler_number
-    1
-    """
-    sdf = _flat("sdf", sdf, lattice.vertex_count)
-    float_t = type(sdf)
-    if msdf is not None:
-        msdf = _flat("msdf", msdf, lattice.vertex_count)
-    if deform is not None:
-        deform = _flat("deform", deform, 3 * lattice.vertex_count)
-    return _Extraction(lattice, float_t).run(sdf, msdf, deform, template)
-
-
-def _flat(name: str, field: Any, count: int) -> Any:
-    """The field as a flat array (``Array3f`` stays), checked for its size and for NaN."""
-    if dr.is_tensor_v(field):
-        field = field.array
-    parts = list(dr.detach(field)) if dr.depth_v(field) == 2 else [dr.detach(field)]
-    size = sum(dr.width(part) for part in parts)
-    if size != count:
-        raise UserError(f"{name} has {size} values, but the lattice needs {count}")
-    for part in parts:
-        # A sum reads the field once and is not finite if any value is not; should it have overflowed,
-        # look again value by value.
-        if not dr.isfinite(dr.sum(part))[0] and not dr.all(dr.isfinite(part))[0]:
-            raise UserError(f"{name} holds NaN or infinite values")
-    return field
-
-
 def _expand(bits: Any, log2_slots: int) -> tuple[Any, Any]:
     """The set bits of an array of bit sets in order, as (index of the set, number of the bit)."""
     uint_t = type(bits)
@@ -125,8 +67,8 @@ class _Polygons:
         return result
 
 
-class _Extraction:
-    """The types and constants that the steps of one extraction share."""
+class TetExtraction:
+    """One extraction; holds the types and constants that its steps share."""
 
     def __init__(self, lattice: TetLattice, float_t: type):
         self.lattice = lattice
@@ -142,6 +84,7 @@ class _Extraction:
         self.margin = dr.opaque(float_t, (16 * 2.0**-24 / lattice.spacing) ** 0.5)
 
     def run(self, sdf: Any, msdf: Any, deform: Any, with_template: bool) -> SurfaceMesh:
+        """The mesh of flat fields that ``extract`` has checked."""
         s = dr.detach(sdf)
         cell = self.candidate_cells(s)
         if dr.width(cell) == 0:
@@ -162,12 +105,11 @@ class _Extraction:
         dr.eval(a, b)
         polygons = self.polygons(cell, signs, tets, record)
 
-        if msdf is None:
-            kept, dropped = a, []
-        else:
+        kept_count = count
+        if msdf is not None:
             positive = self.edge_points(s, a, b).interpolate(dr.detach(msdf)) >= _NEGATIVE
             kept, dropped = dr.compress(positive), dr.compress(~positive)
-        kept_count = dr.width(kept)
+            kept_count = dr.width(kept)
         if kept_count == 0 and not with_template:
             return self.empty_mesh(False)
         if kept_count in (0, count):

@@ -276,3 +276,12 @@ def test_huge_finite_fields_are_no_error():
 def test_wrong_sizes(sizes, message):
     with pytest.raises(UserError, match=message):
         _mesh(TetLattice(3), *(np.ones(n) for n in sizes))
+
+
+def test_too_many_vertices(monkeypatch):
+    from gshell_mi.extraction import tetrahedra
+
+    monkeypatch.setattr(tetrahedra, "_MAX_VERTICES", 100)
+    lattice = TetLattice(8)
+    with pytest.raises(UserError, match="more than the 100 supported; sdf should be smoother"):
+        extract(lattice, _ball(lattice))

@@ -1,0 +1,67 @@
+"""The entrance to extraction: checks the fields and hands them to the lattice's algorithm."""
+
+from typing import Any
+
+import drjit as dr
+
+from ..errors import UserError
+from ..lattice import TetLattice
+from .surface_mesh import SurfaceMesh
+from .tetrahedra import TetExtraction
+
+
+def extract(
+    lattice: TetLattice, sdf: Any, msdf: Any = None, deform: Any = None, *, template: bool = False
+) -> SurfaceMesh:
+    """The surface ``{sdf = 0, msdf >= 0}`` as a triangle mesh, differentiable in all three fields.
+
+    A vertex is inside where ``sdf < 0``; faces point outwards. Where a field crosses 0 very close to a
+    lattice vertex (or is exactly 0 there) the mesh vertex is kept a small fraction of the edge away, so
+    that no triangle degenerates; derivatives are those of the formula at the shifted point. The surface
+    ends in an open boundary where it leaves the lattice: a field that is positive on the border of the
+    lattice has a watertight template.
+
+    Args:
+        lattice: the lattice of n vertices; its docstring gives their order.
+        sdf: signed distance in lattice units, Dr.Jit ``Float`` or tensor of n values. Its type decides
+            the backend that everything is computed on.
+        msdf: manifold signed distance (n values); None keeps the whole template.
+        deform: offsets of the lattice vertices as ``Array3f`` of n or flat ``Float`` of 3 n values
+            (x0, y0, z0, x1, ...), clipped to [-1, 1], where 1 is ``lattice.max_offset``; None for none.
+        template: also return the watertight template as ``SurfaceMesh.template``.
+
+    Raises:
+        UserError: a field has a wrong size or holds NaN or infinity; the sentence names it.
+
+    >>> import drjit as dr, drjit.llvm.ad as d
+    >>> lattice = TetLattice(16)
+    >>> p = lattice.points(d.Float)
+    >>> ball = extract(lattice, dr.norm(p) - 0.5)
+    >>> ball.to_trimesh().is_watertight, ball.to_trimesh().euler_number
+    (True, 2)
+    >>> bowl = extract(lattice, dr.norm(p) - 0.5, -p.z)  # the half z <= 0
+    >>> bowl.to_trimesh().euler_number
+    1
+    """
+    sdf = _checked("sdf", sdf, lattice.vertex_count)
+    if msdf is not None:
+        msdf = _checked("msdf", msdf, lattice.vertex_count)
+    if deform is not None:
+        deform = _checked("deform", deform, 3 * lattice.vertex_count)
+    return TetExtraction(lattice, type(sdf)).run(sdf, msdf, deform, template)
+
+
+def _checked(name: str, field: Any, count: int) -> Any:
+    """The field as a flat array (``Array3f`` stays), checked for its size and for NaN."""
+    if dr.is_tensor_v(field):
+        field = field.array
+    parts = list(dr.detach(field)) if dr.depth_v(field) == 2 else [dr.detach(field)]
+    size = sum(dr.width(part) for part in parts)
+    if size != count:
+        raise UserError(f"{name} has {size} values, but the lattice needs {count}")
+    for part in parts:
+        # A sum reads the field once and is not finite if any value is not; should it have overflowed,
+        # look again value by value.
+        if not dr.isfinite(dr.sum(part))[0] and not dr.all(dr.isfinite(part))[0]:
+            raise UserError(f"{name} holds NaN or infinite values")
+    return field
