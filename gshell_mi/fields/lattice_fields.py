@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 
 from ..errors import UserError
 from ..lattice import TetLattice
@@ -35,6 +36,23 @@ class LatticeFields:
     @property
     def lattice(self) -> TetLattice:
         return TetLattice(round(self.sdf.size ** (1 / 3)) - 1)
+
+    def resampled(self, resolution: int) -> "LatticeFields":
+        """The fields on another lattice, interpolated trilinearly.
+
+        Offsets are kept as lengths: they double in units of ``deform`` when the cells halve, and are
+        clipped to what the new lattice allows.
+        """
+        old, new = self.lattice, TetLattice(resolution)
+
+        def zoom(values: np.ndarray) -> np.ndarray:
+            volume = values.reshape((old.stride,) * 3)
+            return ndimage.zoom(volume, new.stride / old.stride, order=1, mode="nearest").ravel()
+
+        scale = old.max_offset / new.max_offset
+        deform = np.stack([zoom(self.deform[axis::3]) for axis in range(3)], axis=-1) * scale
+        clipped = np.clip(deform, -1, 1).astype(np.float32)
+        return LatticeFields(zoom(self.sdf), zoom(self.msdf), clipped.ravel())
 
     def save(self, path: str | Path) -> None:
         """Writes a compressed .npz with the arrays ``sdf``, ``msdf`` and ``deform``."""

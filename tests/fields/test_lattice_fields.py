@@ -44,6 +44,21 @@ def test_unreadable(tmp_path):
             LatticeFields.load(tmp_path / name)
 
 
+@pytest.mark.parametrize("resolution", [4, 5, 8, 16])
+def test_resampling_keeps_linear_fields_and_lengths(resolution):
+    old, new = TetLattice(8), TetLattice(resolution)
+    p = old.vertex_positions()
+    offset = np.array([0.1, -0.2, 0.3]) * p  # of at most 0.3 in units of the old cells
+    fields = LatticeFields(p[:, 0], p @ np.float32([1, 2, 3]), offset.astype(np.float32).ravel())
+    result = fields.resampled(resolution)
+    q = new.vertex_positions()
+    assert result.lattice == new and result.sdf.dtype == result.deform.dtype == np.float32
+    np.testing.assert_allclose(result.sdf, q[:, 0], atol=1e-5)
+    np.testing.assert_allclose(result.msdf, q @ [1, 2, 3], atol=1e-5)
+    lengths = result.deform.reshape(-1, 3) * new.max_offset
+    np.testing.assert_allclose(lengths, np.array([0.1, -0.2, 0.3]) * q * old.max_offset, atol=1e-6)
+
+
 @pytest.mark.parametrize("radius", [0, 1, -0.5, 2.0])
 def test_sphere_must_fit(radius):
     with pytest.raises(UserError, match="between 0 and 1, not be"):
