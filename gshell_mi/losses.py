@@ -8,7 +8,7 @@ import mitsuba as mi
 
 def tonemap(radiance):
     """Logarithmic tone curve ``log(1 + x)``: bright pixels stop dominating; 0 stays 0."""
-    return dr.log(1 + dr.fmax(radiance, 0))
+    return dr.log(1 + dr.maximum(radiance, 0))
 
 
 def log_l1(image: mi.TensorXf | mi.Color3f, target: mi.TensorXf | mi.Color3f) -> mi.Float:
@@ -40,7 +40,7 @@ def transparency(alpha) -> mi.Float:
 def chroma_difference(first: mi.Color3f, second: mi.Color3f) -> mi.Float:
     """Mean squared distance of the chromaticities ``c / (r + g + b)`` of two radiances."""
     def chroma(color):
-        return color / dr.fmax(color.x + color.y + color.z, 1e-4)
+        return color / dr.maximum(color.x + color.y + color.z, 1e-4)
 
     return _mean(dr.squared_norm(chroma(first) - chroma(second)))
 

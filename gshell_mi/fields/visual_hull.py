@@ -80,13 +80,13 @@ def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray
         filled = plain = _cone_distance(points, views, index, mask_distance(alpha))
         if _has_holes(alpha):
             plain = _cone_distance(points, views, index, mask_distance(alpha, fill_holes=False))
-        carved = dr.fmax(carved, filled)
+        carved = dr.maximum(carved, filled)
         for rank in range(votes):
-            daylight[rank], plain = dr.fmax(daylight[rank], plain), dr.fmin(daylight[rank], plain)
+            daylight[rank], plain = dr.maximum(daylight[rank], plain), dr.minimum(daylight[rank], plain)
         dr.eval(carved, daylight)
         if progress:
             progress()
-    distance = dr.fmax(carved, daylight[-1])
+    distance = dr.maximum(carved, daylight[-1])
     return dr.select(distance == -dr.inf, dr.inf, distance)
 
 

@@ -119,7 +119,7 @@ class JointStage:
         rate = decay * config.geometry_lr * cell
         optimizer.set_learning_rate({"sdf": rate, "msdf": rate, "deform": decay * config.deform_lr})
         optimizer.step()
-        optimizer["deform"] = dr.fmin(dr.fmax(optimizer["deform"], -1), 1)
+        optimizer["deform"] = dr.minimum(dr.maximum(optimizer["deform"], -1), 1)
 
     def _step_shading(self, decay: float) -> None:
         config, optimizer = self.config, self.shading

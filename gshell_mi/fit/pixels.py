@@ -56,7 +56,7 @@ class PixelPool:
         """``count`` pixels; the same ones for the same ``seed`` and ``step``."""
         # One stream per step: a resumed run draws what the uninterrupted one would have drawn.
         random = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed), initseq=_sequence(count, step))
-        pixel = dr.fmin(mi.UInt32(random.next_float32() * self.count), self.count - 1)
+        pixel = dr.minimum(mi.UInt32(random.next_float32() * self.count), self.count - 1)
         view = dr.gather(mi.UInt32, self._view, pixel)
         local = pixel - dr.gather(mi.UInt32, self._first, view)
         width, height = dr.gather(mi.UInt32, self._width, view), dr.gather(mi.UInt32, self._height, view)
