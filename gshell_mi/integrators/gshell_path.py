@@ -130,6 +130,7 @@ class GShellPathIntegrator(ADIntegrator):
                                for u in term.sides())
                 term.jump = reparameterised_film.film_channels(film, left - right, mi.Float(0), [],
                                                                mi.Color0f())
+                term.weight /= LIGHT_BATCHES
                 dr.eval(term.jump)
                 yield term
 

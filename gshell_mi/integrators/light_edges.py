@@ -42,15 +42,16 @@ def sample_directions(scene, sampler):
     box = scene.bbox()
     it.p = mi.Point3f(box.center()) if box.valid() else mi.Point3f(0)
     sample = sampler.next_2d()
-    stratum = dr.arange(mi.UInt32, BATCH)
-    uniform = mi.warp.square_to_uniform_sphere(
-        mi.Point2f((mi.Float(stratum) + sample.x) / BATCH, sample.y))
     environment = scene.environment()
+    index = dr.arange(mi.UInt32, BATCH)
+    strata = BATCH if environment is None else BATCH // 2
+    uniform = mi.warp.square_to_uniform_sphere(
+        mi.Point2f((mi.Float(index % strata) + sample.x) / strata, sample.y))
     if environment is None:
         return LightSources(mi.Vector3f(uniform), False, mi.Float(4 * dr.pi / BATCH),
                             dr.ones(mi.Float, BATCH), None)
     ds, _ = environment.sample_direction(it, sampler.next_2d())
-    direction = dr.select(stratum < BATCH // 2, ds.d, uniform)
+    direction = dr.select(index < strata, ds.d, uniform)
     ds.d = direction
     density = 0.5 * environment.pdf_direction(it, ds) + 0.5 / (4 * dr.pi)
     si = dr.zeros(mi.SurfaceInteraction3f, BATCH)
@@ -198,7 +199,7 @@ def shadow_points(scene, sensor, mesh, table, sources, samples, sampler):
     _, y, towards = edge_and_direction(flat, start, end, t, source)
     lift = 1e-4 * (1 + dr.max(dr.abs(y)))
     pi = scene.ray_intersect_preliminary(mi.Ray3f(y - towards * lift, -towards))
-    p = y - towards * (lift + pi.t)
+    p = mi.Point3f(y - towards * (lift + pi.t))
     # The camera has to see the shadow, and the film to cover it.
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
     offset = p - viewpoint

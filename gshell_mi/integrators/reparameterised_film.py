@@ -174,11 +174,12 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
         dr.eval(on_values, on_shift, on_det)
         tables = scene_edge_tables(scene)
         warp = Warp(scene, tables, sensor, samples, integrator)
+        outputs = []
         for term in integrator.boundary_terms(scene, tables, sensor, seed):
             on_jump = FilmSplat(film, 1, term.film).gather(image_adjoint)
             jump = sum(x * d for x, d in zip(term.jump, on_jump, strict=True))
             with dr.resume_grad():
-                dr.backward_from(dr.detach(jump) * term.swept(warp))
+                outputs.append(dr.detach(jump) * term.swept(warp))
         with dr.resume_grad():
             shifted, det = warp(samples.u)
             ray, weight = samples.rays(sensor, shifted)
@@ -188,8 +189,12 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
                 return sum(x * d for x, d in zip(channels, on_values, strict=True))
 
             total = integrator.attached(dr.ADMode.Backward, scene, sampler, ray, state, on_sample)
-            total += dr.dot(shifted, on_shift) + det * on_det
-            dr.backward_from(total)
+            outputs.append(total + dr.dot(shifted, on_shift) + det * on_det)
+            # One traversal: a second would find the edges of what the outputs share gone.
+            for output in outputs:
+                dr.set_grad(output, 1)
+                dr.enqueue(dr.ADMode.Backward, output)
+            dr.traverse(dr.ADMode.Backward)
         dr.eval()
 
 
@@ -201,24 +206,20 @@ def render_forward(integrator, scene, sensor, seed, spp):
         state, values = _primal(integrator, scene, sensor, sampler, samples)
         tables = scene_edge_tables(scene)
         warp = Warp(scene, tables, sensor, samples, integrator)
-        image = [dr.zeros(mi.Float, 1) for _ in values]
-        for term in integrator.boundary_terms(scene, tables, sensor, seed):
-            with dr.resume_grad():
-                swept = term.swept(warp)
-                dr.forward_to(swept, flags=dr.ADFlag.ClearEdges)
-                swept = dr.grad(swept)
-            terms = FilmSplat(film, 1, term.film).scatter([x * swept for x in term.jump])
-            image = [a + b for a, b in zip(image, terms, strict=True)]
+        boundary = list(integrator.boundary_terms(scene, tables, sensor, seed))
         with dr.resume_grad():
+            swept = [term.swept(warp) for term in boundary]
             shifted, det = warp(samples.u)
             ray, weight = samples.rays(sensor, shifted)
 
             def on_sample(value, alpha, aovs):
                 return film_channels(film, value * weight, alpha, aovs, ray.wavelengths)
 
-            tangents, (shift, divergence) = integrator.attached(
-                dr.ADMode.Forward, scene, sampler, ray, state, on_sample, (shifted, det))
-        dr.eval(tangents, shift, divergence)
-        terms = FilmSplat(film, spp, samples.u, values).tangent(tangents, shift, divergence)
-        image = [a + b for a, b in zip(image, terms, strict=True)]
+            tangents, (shift, divergence, *swept) = integrator.attached(
+                dr.ADMode.Forward, scene, sampler, ray, state, on_sample, (shifted, det, *swept))
+        dr.eval(tangents, shift, divergence, swept)
+        image = FilmSplat(film, spp, samples.u, values).tangent(tangents, shift, divergence)
+        for term, area in zip(boundary, swept, strict=True):
+            jumps = FilmSplat(film, 1, term.film).scatter([x * area for x in term.jump])
+            image = [a + b for a, b in zip(image, jumps, strict=True)]
         return _develop(film, image, integrator.aov_names())
