@@ -48,7 +48,13 @@ $(VENV)/.test: $(VENV)/.package
 # Dr.Jit's wheels leave two libraries to the system: libatomic, and LLVM, which they load when first used.
 $(VENV)/.llvm: $(VENV)/.package
 	@$(PY) -c 'import drjit' 2>/dev/null || .ci/apt-install libatomic1
-	@$(PY) -m gshell_mi.doctor --llvm 2>/dev/null || .ci/apt-install libllvm
+	@$(PY) -m gshell_mi.doctor --llvm 2>/dev/null || .ci/apt-install libllvm 2>/dev/null || \
+	    if $(PY) -m gshell_mi.doctor --llvm 2>&1 | grep -q mitsuba==; then \
+	        echo "The LLVM found needs Mitsuba 3.9.0: installing it ..."; \
+	        $(PY) -m pip install --quiet mitsuba==3.9.0; \
+	    else \
+	        .ci/apt-install libllvm; \
+	    fi
 	@$(PY) -m gshell_mi.doctor --llvm
 	@touch $@
 

@@ -7,6 +7,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+#: Major and minor version of Dr.Jit.
+DRJIT_VERSION = tuple(int(part) for part in dr.__version__.split(".")[:2])
+
 
 def environment_data(radiance: mi.TensorXf) -> mi.TensorXf:
     """The ``data`` parameter of an ``envmap`` emitter for an image of shape (height, width, 3).

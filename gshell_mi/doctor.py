@@ -19,11 +19,17 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from . import __version__
+from . import __version__, compat
 from .errors import UserError
 
-#: x86 code generation of older versions aborts on the NaN-propagating minimum that Dr.Jit 1.5 emits.
-MINIMUM_LLVM = 17 if platform.machine().lower() in ("x86_64", "amd64") else 8
+_NAN_MINIMUM = platform.machine().lower() in ("x86_64", "amd64") and compat.DRJIT_VERSION >= (1, 5)
+
+#: Since 1.5 Dr.Jit emits a NaN-propagating minimum, on which LLVM's x86 code generation aborts up to 16;
+#: Mitsuba's own `path` integrator contains it. Otherwise the minimum is Dr.Jit's own.
+MINIMUM_LLVM = 17 if _NAN_MINIMUM else 15
+
+#: The newest release whose Dr.Jit emits no such minimum.
+_MITSUBA_FOR_OLD_LLVM = "3.9.0"
 
 _INSTALL_LLVM = (
     f"install one of version {MINIMUM_LLVM} or later (Debian, Ubuntu: `sudo apt-get install libllvm19`; "
@@ -141,7 +147,10 @@ def _llvm_problem() -> str | None:
         return f"Dr.Jit found no LLVM library: {_INSTALL_LLVM}"
     if found[0] < MINIMUM_LLVM:
         path = _llvm_path() or "a path that the system does not tell"
-        return f"LLVM {found[0]} at {path} is too old for Dr.Jit {dr.__version__}: {_INSTALL_LLVM}"
+        older = ""
+        if _NAN_MINIMUM and found[0] >= 15:
+            older = f", or take `pip install mitsuba=={_MITSUBA_FOR_OLD_LLVM}`, which can use this one"
+        return f"LLVM {found[0]} at {path} is too old for Dr.Jit {dr.__version__}: {_INSTALL_LLVM}{older}"
     return None
 
 

@@ -72,7 +72,7 @@ def test_derivative_of_a_sphere_volume():
     radius = mi.Float(0.6)
     dr.enable_grad(radius)
     mesh = extract(lattice, dr.norm(lattice.points(mi.Float)) - radius)
-    a, b, c = (dr.gather(mi.Array3f, mesh.vertices, i) for i in mesh.faces)
+    a, b, c = (dr.gather(type(mesh.vertices), mesh.vertices, i) for i in mesh.faces)
     volume = dr.sum(dr.dot(a, dr.cross(b, c))) / 6
     dr.backward(volume)
     assert dr.grad(radius)[0] == pytest.approx(4 * np.pi * 0.6**2, rel=5e-3)

@@ -9,7 +9,7 @@ from topology import assert_manifold, boundary_edges, component_count, euler_cha
 
 from gshell_mi import UserError
 from gshell_mi.extraction import extract
-from gshell_mi.lattice import TetLattice
+from gshell_mi.lattice import TetLattice, array_type
 
 SPECIAL = [0.0, -0.0, 1.0, -1.0, 1e-30, -1e-30, 1e-7, -1e-7, 1e-45, -1e-45, 3e38, -3e38, 0.25, -0.75]
 DENORMAL = 2.0**-126  # numbers below may count as 0
@@ -205,7 +205,7 @@ def test_offsets_are_clipped_and_scaled():
     sdf = lattice.points(mi.Float).z - 0.25
     plain = extract(lattice, sdf)
     for value, shift in ((0.5, 0.5), (1, 1), (7, 1), (-3, -1)):
-        moved = extract(lattice, sdf, None, dr.full(mi.Array3f, value, n))
+        moved = extract(lattice, sdf, None, dr.full(array_type(mi.Float, "Array3f"), value, n))
         expected = np.array(plain.vertices) + shift * lattice.max_offset
         np.testing.assert_allclose(np.array(moved.vertices), expected, atol=1e-6)
 
@@ -216,7 +216,7 @@ def test_deform_layouts_agree():
     sdf = _ball(lattice)
     flat = extract(lattice, sdf, None, mi.Float(deform.ravel()))
     tensor = extract(lattice, mi.TensorXf(sdf, (6, 6, 6)), None, mi.TensorXf(deform))
-    nested = extract(lattice, sdf, None, mi.Array3f(deform.T))
+    nested = extract(lattice, sdf, None, array_type(mi.Float, "Array3f")(deform.T))
     for other in (tensor, nested):
         np.testing.assert_array_equal(np.array(flat.vertices), np.array(other.vertices))
 
