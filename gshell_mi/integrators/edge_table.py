@@ -97,7 +97,7 @@ def build_edge_table(positions, faces) -> EdgeTable:
     >>> quad = mi.Float(0, 0, 0,  1, 0, 0,  1, 1, 0,  0, 1, 0)
     >>> table = build_edge_table(quad, mi.UInt32(0, 1, 2,  0, 2, 3,  0, 0, 0))
     >>> open_edges = table.degree == 1
-    >>> dr.count(open_edges), dr.count(table.degree == 2)
+    >>> dr.count(open_edges)[0], dr.count(table.degree == 2)[0]
     (4, 1)
     """
     positions = dr.detach(positions)

@@ -26,4 +26,4 @@ def variant(request) -> str:
 @pytest.fixture(scope="session")
 def scenes_dir() -> Path:
     """The scenes folder of this repository."""
-    return Path(__file__).parents[1] / "scenes"
+    return Path(__file__).parent / "scenes"
