@@ -36,7 +36,7 @@ def silhouette_mask(positions, faces, table, viewpoint):
     >>> table = build_edge_table(tet, faces)
     >>> dr.count(silhouette_mask(tet, faces, table, mi.Point3f(0.2, 0.2, -5)))[0]
     3
-    >>> dr.count(silhouette_mask(tet, faces, table, mi.Point3f(5, -4, -5)))
+    >>> dr.count(silhouette_mask(tet, faces, table, mi.Point3f(5, -4, -5)))[0]
     4
     """
     n = dr.width(faces)
