@@ -119,20 +119,19 @@ class GShellPathIntegrator(ADIntegrator):
         for _ in range(LIGHT_BATCHES):
             sources = sample_directions(scene, sampler)
             for mesh, table in tables:
-                term = shadow_points(scene, sensor, mesh, table, sources, max(int(per_mesh), 1), sampler)
-                if term is None:
-                    continue
-                direction = dr.gather(mi.Vector3f, dr.ravel(sources.position), term.source)
-                path_sampler = sampler.clone()
-                path_sampler.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)),
-                                  dr.width(term.source))
-                left, right = (self._reflected(scene, sensor, u, direction, path_sampler.clone())
-                               for u in term.sides())
-                term.jump = reparameterised_film.film_channels(film, left - right, mi.Float(0), [],
-                                                               mi.Color0f())
-                term.weight /= LIGHT_BATCHES
-                dr.eval(term.jump)
-                yield term
+                for term in shadow_points(scene, sensor, mesh, table, sources, max(int(per_mesh), 1),
+                                          sampler):
+                    direction = dr.gather(mi.Vector3f, dr.ravel(sources.position), term.source)
+                    path_sampler = sampler.clone()
+                    path_sampler.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)),
+                                      dr.width(term.source))
+                    left, right = (self._reflected(scene, sensor, u, direction, path_sampler.clone())
+                                   for u in term.sides())
+                    term.jump = reparameterised_film.film_channels(film, left - right, mi.Float(0), [],
+                                                                   mi.Color0f())
+                    term.weight /= LIGHT_BATCHES
+                    dr.eval(term.jump)
+                    yield term
 
     def _reflected(self, scene, sensor, u, direction, sampler):
         """Light from one direction that the surface seen at a film position reflects."""

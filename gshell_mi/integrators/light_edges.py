@@ -177,69 +177,87 @@ class BoundaryTerm:
 
 
 def shadow_points(scene, sensor, mesh, table, sources, samples, sampler):
-    """Draws points on the shadow boundaries that a mesh casts; ``None`` if none is seen."""
-    film = sensor.film()
+    """Draws points on the shadow boundaries that a mesh causes, and yields those that are seen.
+
+    There are two kinds: the shadows that the edges cast, and the edges themselves, where the mesh
+    turns away from the light (its shading normals do so elsewhere, so the light jumps there).
+    """
     drawn = _sample_edges(mesh, table, sources, samples, sampler)
     if drawn is None:
-        return None
-    start, end, source, weight = drawn
-    flat = dr.detach(mesh.vertex_positions_buffer())
-    n = dr.width(start)
-    edge_sampler = sampler.clone()
-    edge_sampler.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)), n)
-    t = edge_sampler.next_1d()
-    light = dr.ravel(sources.position)
+        return
+    fraction = sampler.clone()
+    fraction.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)), dr.width(drawn[0]))
+    drawn = (*drawn, fraction.next_1d())
+    dr.eval(drawn)
+    for cast in (True, False):
+        term = _seen_points(scene, sensor, mesh, sources, drawn, cast)
+        if term is not None:
+            yield term
 
-    def edge_and_direction(buffer, start, end, t, source):
-        p, q = dr.gather(mi.Point3f, buffer, start), dr.gather(mi.Point3f, buffer, end)
-        y = dr.lerp(p, q, t)
-        z = dr.gather(mi.Vector3f, light, source)
-        return q - p, y, dr.normalize(z - y) if sources.is_point else z
 
-    _, y, towards = edge_and_direction(flat, start, end, t, source)
-    lift = 1e-4 * (1 + dr.max(dr.abs(y)))
-    pi = scene.ray_intersect_preliminary(mi.Ray3f(y - towards * lift, -towards))
-    p = mi.Point3f(y - towards * (lift + pi.t))
-    # The camera has to see the shadow, and the film to cover it.
+def _edge_points(positions, sources, start, end, source, t):
+    """Edge vectors, points and unit directions to the light; attached if the positions are."""
+    p, q = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
+    y = mi.Point3f(dr.lerp(p, q, t))
+    z = dr.gather(mi.Vector3f, dr.ravel(sources.position), source)
+    return q - p, y, dr.normalize(z - y) if sources.is_point else z
+
+
+def _shadow_ray(y, towards):
+    """Ray away from the light that starts just behind an edge point."""
+    lift = 1e-4 * (1 + dr.max(dr.abs(dr.detach(y))))
+    return mi.Ray3f(mi.Point3f(y - towards * lift), -towards)
+
+
+def _seen_points(scene, sensor, mesh, sources, drawn, cast):
+    film = sensor.film()
+    start, end, source, weight, t = drawn
+    _, y, towards = _edge_points(dr.detach(mesh.vertex_positions_buffer()), sources, start, end, source, t)
+    p, hit = y, mi.Bool(True)
+    if cast:
+        ray = _shadow_ray(y, towards)
+        pi = scene.ray_intersect_preliminary(ray)
+        p, hit = mi.Point3f(ray(pi.t)), pi.is_valid()
+    # The camera has to see the point, and the film to cover it.
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
     offset = p - viewpoint
     distance = dr.norm(offset)
-    to_camera = dr.detach(sensor.world_transform()).inverse()
-    ahead = pi.is_valid() & ((to_camera @ p).z > sensor.near_clip())
-    blocked = scene.ray_test(mi.Ray3f(viewpoint, offset / distance, distance * (1 - 1e-3), 0.0,
-                                      mi.Color0f()), ahead)
+    hit &= (dr.detach(sensor.world_transform()).inverse() @ p).z > sensor.near_clip()
     c = project_to_film(sensor, p)
     border = film.rfilter().border_size() if film.sample_border() else 0
-    size = mi.Point2f(film.crop_size())
-    seen = ahead & ~blocked & dr.all((c > -border) & (c < size + border))
-    dr.eval(seen, t)
-    kept = dr.compress(seen)
+    hit &= dr.all((c > -border) & (c < mi.Point2f(film.crop_size()) + border))
+    hit &= ~scene.ray_test(mi.Ray3f(viewpoint, offset / distance, distance * (1 - 1e-3), 0.0, mi.Color0f()),
+                           hit)
+    kept = dr.compress(hit)
     if dr.width(kept) == 0:
         return None
-    start, end, source = (dr.gather(mi.UInt32, x, kept) for x in (start, end, source))
-    t, weight = dr.gather(mi.Float, t, kept), dr.gather(mi.Float, weight, kept)
-    dr.eval(start, end, source, t, weight)
+    start, end, source, weight, t = (dr.gather(type(x), x, kept) for x in drawn)
+    dr.eval(start, end, source, weight, t)
 
     with dr.resume_grad():
-        edge, y, towards = edge_and_direction(mesh.vertex_positions_buffer(), start, end, t, source)
-        lift = 1e-4 * (1 + dr.max(dr.abs(dr.detach(y))))
-        ray = mi.Ray3f(y - towards * lift, -towards)
-        with dr.suspend_grad():
-            pi = scene.ray_intersect_preliminary(dr.detach(ray))
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
-        film_position = project_to_film(sensor, si.p)
-    # Along the edge, the shadow moves by the edge vector projected along the light on the receiver.
-    edge, normal, towards = dr.detach(edge), dr.detach(si.n), dr.detach(towards)
-    if sources.is_point:
-        z = mi.Point3f(dr.gather(mi.Vector3f, light, source))
-        edge *= dr.norm(dr.detach(si.p) - z) / dr.norm(dr.detach(y) - z)
-    slide = edge - towards * (dr.dot(normal, edge) / dr.dot(normal, towards))
-    step = 1e-3 * dr.norm(dr.detach(si.p) - viewpoint) / dr.maximum(dr.norm(slide), 1e-20)
+        edge, y, towards = _edge_points(mesh.vertex_positions_buffer(), sources, start, end, source, t)
+        p = y
+        if cast:
+            ray = _shadow_ray(y, towards)
+            with dr.suspend_grad():
+                pi = scene.ray_intersect_preliminary(dr.detach(ray))
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+            p = si.p
+        moving = project_to_film(sensor, p)
+    edge, y, p, towards = dr.detach(edge), dr.detach(y), dr.detach(p), dr.detach(towards)
+    if cast:
+        # Along the edge, the shadow moves by the edge vector projected along the light.
+        if sources.is_point:
+            z = mi.Point3f(dr.gather(mi.Vector3f, dr.ravel(sources.position), source))
+            edge *= dr.norm(p - z) / dr.norm(y - z)
+        normal = dr.detach(si.n)
+        edge -= towards * (dr.dot(normal, edge) / dr.dot(normal, towards))
+    step = 1e-3 * dr.norm(p - viewpoint) / dr.maximum(dr.norm(edge), 1e-20)
     with dr.suspend_grad():
-        there = project_to_film(sensor, dr.detach(si.p) + slide * step)
-        here = project_to_film(sensor, dr.detach(si.p) - slide * step)
-    tangent = mi.Vector2f(there - here) / (2 * step)
-    usable = pi.is_valid() & dr.isfinite(dr.squared_norm(tangent)) & (dr.squared_norm(tangent) > 0)
-    weight = dr.select(usable, weight, 0)
-    tangent = dr.select(usable, tangent, mi.Vector2f(1, 0))
-    return BoundaryTerm(film_position, tangent, source, weight)
+        tangent = mi.Vector2f(project_to_film(sensor, p + edge * step) -
+                              project_to_film(sensor, p - edge * step)) / (2 * step)
+    usable = dr.isfinite(dr.squared_norm(tangent)) & (dr.squared_norm(tangent) > 0)
+    if cast:
+        usable &= pi.is_valid()
+    return BoundaryTerm(moving, dr.select(usable, tangent, mi.Vector2f(1, 0)), source,
+                        dr.select(usable, weight, 0))
