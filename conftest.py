@@ -27,3 +27,11 @@ def variant(request) -> str:
 def scenes_dir() -> Path:
     """The scenes folder of this repository."""
     return Path(__file__).parent / "scenes"
+
+
+@pytest.fixture(scope="session")
+def bowl_scene(tmp_path_factory) -> Path:
+    """A small fit scene with targets, an open half-sphere; to be copied before it is changed."""
+    from bowl import write_fit_scene
+
+    return write_fit_scene(tmp_path_factory.mktemp("bowl"))

@@ -84,8 +84,15 @@ def _load(path: Path) -> mi.Scene:
     except UserError:
         raise
     except Exception as error:
-        reason = str(error).strip().splitlines()
-        raise UserError(f"Scene '{path}' cannot be loaded by Mitsuba: {reason[0] if reason else error!r}") from error
+        raise UserError(f"Scene '{path}' cannot be loaded by Mitsuba: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    """The one line of Mitsuba's message that says what is wrong."""
+    lines = str(error).strip().splitlines() or [repr(error)]
+    # A plugin's own complaint comes below the traceback that Mitsuba puts into its message.
+    _, found, complaint = lines[-1].partition(f"{UserError.__name__}: ")
+    return complaint if found else lines[0]
 
 
 def _the_subject(scene: mi.Scene, path: Path) -> mi.Shape:

@@ -52,9 +52,10 @@ class Checkpoint:
                 os.fsync(file.fileno())
             os.replace(partial, path)
         except OSError as error:
-            partial.unlink(missing_ok=True)
             raise UserError(f"Checkpoint '{path}' cannot be written ({error.strerror}); free some space or "
                             f"choose another folder with -o, then continue with --resume.") from error
+        finally:
+            partial.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:

@@ -19,6 +19,8 @@ class FitConfig:
     """Seed of every random number of the fit."""
     resolution: int | None = None
     """Cells per side of the lattice; default: that of the scene's gshell shape (64)."""
+    checkpoint_seconds: float = 10.0
+    """Seconds between checkpoints: what a kill loses at most."""
     known_light: bool = False
     """Keep the scene's light as it is instead of optimising it."""
 
@@ -85,6 +87,10 @@ class FitConfig:
         for name in ("ghost_iterations", "ghost_batch", "ghost_sheets", "spp", "primal_spp", "light_height"):
             if getattr(self, name) < 1:
                 raise UserError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}.")
+        if self.resolution is not None and self.resolution < 4:
+            raise UserError(f"--resolution must be at least 4 cells, not {self.resolution}.")
+        if self.checkpoint_seconds < 0:
+            raise UserError(f"--checkpoint-seconds must not be negative, and is {self.checkpoint_seconds:g}.")
         if self.iterations < 0:
             raise UserError(f"--iterations must not be negative, and is {self.iterations}.")
         if self.max_depth < 2:

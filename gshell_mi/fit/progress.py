@@ -57,7 +57,11 @@ class Progress:
                 detail = f"loss {values['loss']:.4f}  PSNR {values['psnr']:.1f} dB  " + detail
             self._bars.update(task, completed=done, detail=detail)
 
-        yield advance
+        try:
+            yield advance
+        except BaseException:
+            self._bars.remove_task(task)  # what remains on the terminal is what was done
+            raise
         took = f"{time.monotonic() - begin:.1f} s"
         self._bars.update(task, total=total or 1, completed=total or 1, detail=took)
 

@@ -5,33 +5,30 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
-from ..export import export_fit, make_output_folder
+from ..export import check_output_folder, export_fit, make_output_folder
 from ..fields import LatticeFields
 from ..fields.visual_hull import visual_hull
 from ..lattice import TetLattice
 from ..light import EnvironmentLight
 from ..material import MaterialField
-from ..scene import FitScene, load_fit_scene
+from ..scene import load_fit_scene
 from ..views import PinholeViews
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
 from .config import FitConfig, default_output
 from .joint import JointStage
-from .opening import clean_opacity, msdf_from_template, splat_to_lattice
+from .opening import clean_opacity, close_unjustified, msdf_from_template, splat_to_lattice
 from .pixels import PixelPool
 from .progress import Progress
 from .radiance_ghost import RadianceGhost
-
-#: Seconds between checkpoints: what a kill loses at most.
-CHECKPOINT_SECONDS = 10.0
 
 #: Median reflectance that the first split of radiance into material and light assumes.
 _TYPICAL_REFLECTANCE = 0.5
@@ -87,28 +84,30 @@ class _Fit:
         if resume:
             self.checkpoint = Checkpoint.load(self.path)
             _same_config(self.checkpoint.config, _plain(config))
-        make_output_folder(output, keep=resume, overwrite=overwrite)
+        check_output_folder(output, keep=resume, overwrite=overwrite)
         with progress.stage("targets", None):
             self.scene = load_fit_scene(scene, Path(targets) if targets else None,
                                         on_reference=progress.reference)
-        self.views = PinholeViews.from_sensors(self.scene.sensors)
+            self.views = PinholeViews.from_sensors(self.scene.sensors)
         if not all(target.has_alpha for target in self.scene.targets):
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
         self.lattice = TetLattice(config.resolution or self.scene.subject.lattice.resolution)
-        self.log = None
+        # Nothing of an earlier fit goes before all is known to be in order.
+        make_output_folder(output, keep=resume)
 
     def run(self) -> FitResult:
-        self.log = open(self.output / "log.jsonl", "a")
         try:
             if self.checkpoint.stage == "hull":
                 self._hull()
+            self._rewind_log()
             if self.checkpoint.stage == "ghost":
                 self._ghost()
             joint = self._joint()
             with self.progress.stage("export", None), self._timed("export"):
                 metrics = export_fit(self.output, self.scene, joint, self.config, self.checkpoint.seconds)
-        finally:
-            self.log.close()
+        except OSError as error:
+            raise UserError(f"'{error.filename or self.output}' cannot be written ({error.strerror or error}); "
+                            f"free some space or mend its permissions, then continue with --resume.") from error
         return FitResult(self.output, metrics)
 
     # --- stages
@@ -144,11 +143,16 @@ class _Fit:
         self._iterate("ghost", self.config.ghost_iterations, ghost.step, {"ghost": ghost.optimizer},
                       {"sdf": sdf})
         logits = clean_opacity(ghost.smoothed_logits(), vertices, faces, self.config.ghost_min_area)
+        with self.progress.stage("openings", None), self._timed("ghost"):
+            logits = close_unjustified(logits, faces, ghost.image_error, self.config.ghost_gain)
         msdf = msdf_from_template(logits, template, self.lattice)
+        if not (logits > 0).any():
+            raise UserError(f"The radiance ghost found nothing opaque in '{self.scene.path}'; give it more steps "
+                            f"with --ghost-iterations, or check the cameras.")
         front, _ = ghost.radiance()
         radiance, known = splat_to_lattice(mi.Float(front.ravel()), template, self.lattice)
         radiance = radiance.numpy().reshape(-1, 3)
-        light = float(np.median(front[logits > 0].mean(axis=1)) if (logits > 0).any() else front.mean())
+        light = float(np.median(front[logits > 0].mean(axis=1)))
         self._enter("joint", sdf=sdf, msdf=msdf.numpy(), radiance=radiance, known=known.numpy(),
                     light=np.float32(light / _TYPICAL_REFLECTANCE))
 
@@ -190,7 +194,7 @@ class _Fit:
             self.checkpoint.iteration, self.checkpoint.arrays = done, arrays
             self.checkpoint.save(self.path)
 
-        with self.progress.stage(stage, count, first) as advance, self._timed(stage):
+        with self.progress.stage(stage, count, first) as advance:
             saved = time.monotonic()
             for iteration in range(first, count):
                 begin = time.monotonic()
@@ -198,7 +202,8 @@ class _Fit:
                 values = {name: float(value) for name, value in values.items()}
                 self._write_log(stage, iteration, values, time.monotonic() - begin)
                 advance(values)
-                if time.monotonic() - saved > CHECKPOINT_SECONDS:
+                self._spent(stage, time.monotonic() - begin)
+                if time.monotonic() - saved > self.config.checkpoint_seconds:
                     save(iteration + 1)
                     saved = time.monotonic()
         save(count)
@@ -208,28 +213,31 @@ class _Fit:
         self.checkpoint.stage, self.checkpoint.iteration, self.checkpoint.arrays = stage, 0, arrays
         self.checkpoint.save(self.path)
 
-    def _timed(self, stage: str):
-        return _Stopwatch(self.checkpoint.seconds, stage)
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        begin = time.monotonic()
+        yield
+        self._spent(stage, time.monotonic() - begin)
+
+    def _spent(self, stage: str, seconds: float) -> None:
+        self.checkpoint.seconds[stage] = round(self.checkpoint.seconds.get(stage, 0.0) + seconds, 3)
+
+    def _rewind_log(self) -> None:
+        """Drops the lines of steps that a killed run did after its last checkpoint: they are done again."""
+        path, kept = self.output / "log.jsonl", []
+        if path.exists():
+            reached = (STAGES.index(self.checkpoint.stage), self.checkpoint.iteration)
+            for line in path.read_text().splitlines(keepends=True):
+                step = json.loads(line) if line.endswith("\n") else None
+                if step and (STAGES.index(step["stage"]), step["iteration"]) < reached:
+                    kept.append(line)
+        path.write_text("".join(kept))
 
     def _write_log(self, stage: str, iteration: int, values: dict[str, float], seconds: float) -> None:
         rounded = {name: float(f"{value:.6g}") for name, value in values.items()}
-        self.log.write(json.dumps({"stage": stage, "iteration": iteration, **rounded,
-                                   "seconds": round(seconds, 4)}) + "\n")
-        self.log.flush()
-
-
-class _Stopwatch:
-    """Adds the wall time of a block to an entry of a dictionary."""
-
-    def __init__(self, seconds: dict[str, float], name: str):
-        self.seconds, self.name = seconds, name
-
-    def __enter__(self):
-        self.begin = time.monotonic()
-
-    def __exit__(self, *_):
-        elapsed = time.monotonic() - self.begin
-        self.seconds[self.name] = round(self.seconds.get(self.name, 0.0) + elapsed, 3)
+        with open(self.output / "log.jsonl", "a") as log:
+            log.write(json.dumps({"stage": stage, "iteration": iteration, **rounded,
+                                  "seconds": round(seconds, 4)}) + "\n")
 
 
 def _length_scale(to_world: mi.ScalarTransform4f) -> float:
@@ -243,6 +251,6 @@ def _plain(config: FitConfig) -> dict:
 
 def _same_config(before: dict, now: dict) -> None:
     for name, value in now.items():
-        if before.get(name) != value:
+        if before.get(name) != value and name != "checkpoint_seconds":
             raise UserError(f"The checkpoint was made with {name} = {before.get(name)}, not {value}; "
                             f"resume with the same settings or start again with --overwrite.")

@@ -33,7 +33,9 @@ class LightSources:
     is_point: bool      #: which of the two
     weight: object      #: ``Float``, 32: one over the number of samples and their density
     importance: object  #: ``Float``, 32: how densely to sample edges, relative to each other
-    emitted: object     #: ``DirectionSample3f``, 32, for points on emitters, else ``None``
+    emitter: object = None  #: the emitter that all points lie on
+    normal: object = None   #: ``Normal3f``, 32: its normal, for area lights
+    uv: object = None       #: ``Point2f``, 32: its texture coordinates there
 
 
 def sample_directions(scene, sampler):
@@ -49,7 +51,7 @@ def sample_directions(scene, sampler):
         mi.Point2f((mi.Float(index % strata) + sample.x) / strata, sample.y))
     if environment is None:
         return LightSources(mi.Vector3f(uniform), False, mi.Float(4 * dr.pi / BATCH),
-                            dr.ones(mi.Float, BATCH), None)
+                            dr.ones(mi.Float, BATCH))
     ds, _ = environment.sample_direction(it, sampler.next_2d())
     direction = dr.select(index < strata, ds.d, uniform)
     ds.d = direction
@@ -60,7 +62,36 @@ def sample_directions(scene, sampler):
     weight = 1 / (BATCH * density)
     radiance = dr.maximum(radiance, 0.1 * dr.mean(radiance * weight) / (4 * dr.pi) * BATCH)
     dr.eval(direction, weight, radiance)
-    return LightSources(direction, False, weight, radiance * weight, None)
+    return LightSources(direction, False, weight, radiance * weight)
+
+
+def sample_points(emitter, sampler):
+    """Points on an area light, or the position of a point or spot light."""
+    ones = dr.ones(mi.Float, BATCH)
+    if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
+        ps = emitter.shape().sample_position(0.0, sampler.next_2d())
+        dr.eval(ps)
+        return LightSources(mi.Vector3f(ps.p), True, dr.rcp(BATCH * ps.pdf), ones, emitter, ps.n, ps.uv)
+    ds, _ = emitter.sample_direction(dr.zeros(mi.Interaction3f, BATCH), sampler.next_2d())
+    dr.eval(ds)
+    return LightSources(mi.Vector3f(ds.p), True, ones / BATCH, ones, emitter)
+
+
+def light_from_point(scene, si, sources, index, active):
+    """Light that arrives at surface points from points of a batch: direction and value."""
+    z = mi.Point3f(dr.gather(mi.Vector3f, dr.ravel(sources.position), index))
+    ds = dr.zeros(mi.DirectionSample3f, dr.width(index))
+    offset = z - si.p
+    ds.p, ds.dist = z, dr.norm(offset)
+    ds.d = offset / ds.dist
+    ds.emitter = mi.EmitterPtr(sources.emitter)
+    geometry = mi.Float(1)
+    if sources.normal is not None:
+        ds.n = dr.gather(mi.Normal3f, dr.ravel(sources.normal), index)
+        ds.uv = dr.gather(mi.Point2f, dr.ravel(sources.uv), index)
+        geometry = dr.abs_dot(ds.n, ds.d) / dr.square(ds.dist)
+    active = active & ~scene.ray_test(si.spawn_ray_to(z), active)
+    return ds.d, dr.select(active, sources.emitter.eval_direction(si, ds, active) * geometry, 0)
 
 
 def _silhouette_bits(mesh, table, sources):
@@ -91,14 +122,16 @@ def _silhouette_bits(mesh, table, sources):
 def _expand(count):
     """For counts per item, the item of each of the ``sum(count)`` entries and its number there."""
     item = dr.compress(count > 0)
+    if dr.width(item) == 0:
+        return item, item, 0
     count = dr.gather(mi.UInt32, count, item)
     first = dr.prefix_sum(count)
     total = dr.sum(count)[0]
-    mark = dr.zeros(mi.UInt32, max(total, 1))
+    mark = dr.zeros(mi.UInt32, total)
     dr.scatter(mark, mi.UInt32(1), first, mode=dr.ReduceMode.Permute)
     run = dr.cumsum(mark) - 1
-    entry = dr.gather(mi.UInt32, item, run, total > 0)
-    number = dr.arange(mi.UInt32, max(total, 1)) - dr.gather(mi.UInt32, first, run, total > 0)
+    entry = dr.gather(mi.UInt32, item, run)
+    number = dr.arange(mi.UInt32, total) - dr.gather(mi.UInt32, first, run)
     dr.eval(entry, number)
     return entry, number, total
 

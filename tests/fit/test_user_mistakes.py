@@ -1,0 +1,292 @@
+"""What the command says of mistakes: exit code 2, one sentence on stderr that names the culprit, no traces."""
+
+import errno
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from bowl import SHORT, SIZE
+
+from gshell_mi.fit.__main__ import main
+
+
+@pytest.fixture
+def scene(bowl_scene, tmp_path) -> Path:
+    """A copy of the bowl's fit scene, to be spoilt."""
+    shutil.copytree(bowl_scene.parent, tmp_path / "in")
+    return tmp_path / "in" / bowl_scene.name
+
+
+@pytest.fixture
+def told(scene, tmp_path, capfd):
+    """Runs the command on the spoilt scene; returns its sentence after the checks that hold for every mistake."""
+
+    def run(*arguments, path=scene, output=tmp_path / "out", whole=False):
+        capfd.readouterr()
+        before = sorted(output.rglob("*")) if output.is_dir() else None
+        assert main([str(path), "-o", str(output), *SHORT, *arguments]) == 2
+        *stages, sentence = capfd.readouterr().err.strip().splitlines()
+        assert re.fullmatch(r"error: .+", sentence)
+        # What was done before has its bar.
+        assert not stages or whole and all("━" in stage for stage in stages)
+        if not whole:
+            assert (sorted(output.rglob("*")) if output.is_dir() else None) == before
+        return sentence
+
+    return run
+
+
+def change(scene: Path, old: str, new: str) -> None:
+    text = scene.read_text()
+    assert text.count(old) >= 1
+    scene.write_text(text.replace(old, new, 1))
+
+
+def rewrite(target: Path, edit) -> None:
+    """Applies ``edit`` to the pixels of a target."""
+    pixels = np.array(mi.Bitmap(str(target)))
+    mi.Bitmap(np.ascontiguousarray(edit(pixels))).write(str(target))
+
+
+def target(scene: Path, name: str = "view_003") -> Path:
+    return scene.with_suffix("") / f"{name}.exr"
+
+
+# --- the scene
+
+
+def test_missing_scene(told, tmp_path):
+    assert f"'{tmp_path / 'none.xml'}' does not exist" in told(path=tmp_path / "none.xml")
+
+
+def test_not_xml(told, scene):
+    scene.write_text("G-Shell?\n\nno")
+    assert f"Scene '{scene}' cannot be loaded by Mitsuba" in told()
+
+
+def test_unknown_plugin(told, scene):
+    change(scene, 'type="constant"', 'type="sunshine"')
+    assert "sunshine" in told()
+
+
+def test_no_gshell_shape(told, scene):
+    change(scene, 'type="gshell"', 'type="sphere"')
+    change(scene, '<integer name="resolution" value="20"/>', "")
+    assert "has no gshell shape" in told()
+
+
+def test_two_gshell_shapes(told, scene):
+    change(scene, "</shape>", '</shape>\n<shape type="gshell" id="other"/>')
+    assert "has 2 gshell shapes; a fit needs exactly one" in told()
+
+
+def test_no_sensors(told, scene):
+    scene.write_text(re.sub(r"<sensor.*</sensor>", "", scene.read_text(), flags=re.DOTALL))
+    assert "has no sensors" in told()
+
+
+def test_sensors_of_the_same_id(told, scene):
+    change(scene, '"view_004"', '"view_003"')
+    assert "view_003" in told()
+
+
+def test_orthographic_sensor(told, scene):
+    change(scene, '<sensor type="perspective" id="view_000">\n        <float name="fov" value="32"/>',
+           '<sensor type="orthographic" id="view_000">')
+    assert re.search("Sensor 'view_000' is an? .*[Oo]rthographic.*, but a fit needs perspective", told())
+
+
+def test_no_light(told, scene):
+    change(scene, '<emitter type="constant" id="light"/>', "")
+    assert "has no environment emitter with the id 'light'" in told()
+
+
+def test_light_of_another_kind(told, scene):
+    change(scene, '<emitter type="constant" id="light"/>', '<emitter type="point" id="light"/>')
+    assert "no environment emitter with the id 'light'" in told()
+
+
+def test_unknown_grid(told, scene):
+    change(scene, '<integer name="resolution" value="20"/>', '<string name="grid" value="hexagons"/>')
+    assert "grid 'hexagons' is not available" in told()
+
+
+def test_object_outside_the_box(told, scene):
+    change(scene, '<integer name="resolution" value="20"/>',
+           '<integer name="resolution" value="20"/><transform name="to_world"><scale value="0.1"/><translate y="0.8"/></transform>')
+    assert "no common volume in the box" in told(whole=True)
+    assert "no common volume in the box" in told(whole=True), "and a second try is not told of an earlier fit"
+
+
+# --- the targets
+
+
+def test_missing_target(told, scene):
+    target(scene).unlink()
+    assert f"Target '{target(scene)}' is missing" in told()
+
+
+def test_missing_folder_of_targets(told, tmp_path):
+    assert f"'{tmp_path / 'none' / 'view_000.exr'}' is missing" in told("--targets", str(tmp_path / "none"))
+
+
+def test_target_of_another_size(told, scene):
+    rewrite(target(scene), lambda pixels: pixels[:-8])
+    assert f"is {SIZE} x {SIZE - 8} pixels, but its sensor's film is {SIZE} x {SIZE}" in told()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_target_with_nan(told, scene, value):
+    def spoil(pixels):
+        pixels[5, 7, 1] = value
+        return pixels
+
+    rewrite(target(scene), spoil)
+    sentence = told()
+    assert str(target(scene)) in sentence and "NaN or infinity (first at column 7, row 5)" in sentence
+
+
+def test_truncated_target(told, scene):
+    data = target(scene).read_bytes()
+    target(scene).write_bytes(data[: len(data) // 2])
+    assert f"Target '{target(scene)}' cannot be read as an image" in told()
+
+
+def test_grey_target(told, scene):
+    rewrite(target(scene), lambda pixels: pixels[..., :1])
+    assert "a target needs R, G, B and A" in told()
+
+
+def test_alpha_out_of_range(told, scene):
+    rewrite(target(scene), lambda pixels: 255 * pixels)
+    assert "alpha is coverage and lies between 0 and 1" in told()
+
+
+def test_empty_alpha_everywhere(told, scene):
+    for path in scene.with_suffix("").glob("*.exr"):
+        rewrite(path, np.zeros_like)
+    assert "their alpha is 0 everywhere" in told()
+
+
+# --- the settings
+
+
+def test_unknown_variant(told):
+    assert "variant 'scalar_rgb' is not usable" in told("--variant", "scalar_rgb")
+
+
+@pytest.mark.parametrize(("option", "value"), [
+    ("--spp", "0"), ("--ghost-batch", "0"), ("--iterations", "-1"), ("--max-depth", "1"), ("--warmup", "1.5"),
+    ("--resolution", "0"), ("--checkpoint-seconds", "-1"),
+])
+def test_setting_out_of_range(told, option, value):
+    assert option.strip("-").replace("-", " ").split()[-1] in told(option, value)
+
+
+def test_too_few_steps_to_find_anything(told):
+    assert "nothing opaque" in told("--ghost-iterations", "2", whole=True)
+
+
+def test_flag_that_does_not_exist(capfd):
+    with pytest.raises(SystemExit) as stop:
+        main(["scene.xml", "--no-such-flag"])
+    assert stop.value.code == 2 and "no-such-flag" in capfd.readouterr().err
+
+
+# --- the output folder
+
+
+def test_output_below_a_file(told, tmp_path):
+    (tmp_path / "file").write_text("")
+    output = tmp_path / "file" / "out"
+    assert f"'{output}' cannot be made because '{tmp_path / 'file'}' is a file" in told(output=output)
+
+
+@pytest.mark.skipif(os.name == "posix" and os.geteuid() == 0, reason="root may write anywhere")
+def test_output_without_permission(told, tmp_path):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    assert "no permission" in told(output=tmp_path / "locked" / "out")
+
+
+def test_earlier_fit_is_kept(told, tmp_path):
+    output = tmp_path / "out"
+    output.mkdir()
+    (output / "mesh.ply").write_text("precious")
+    assert "holds an earlier fit (mesh.ply)" in told()
+    assert (output / "mesh.ply").read_text() == "precious"
+
+
+def test_earlier_fit_survives_a_mistake_with_overwrite(told, scene, tmp_path):
+    output = tmp_path / "out"
+    output.mkdir()
+    (output / "mesh.ply").write_text("precious")
+    target(scene).unlink()
+    assert "is missing" in told("--overwrite")
+    assert (output / "mesh.ply").read_text() == "precious"
+
+
+def test_resume_without_checkpoint(told):
+    assert "There is no checkpoint" in told("--resume")
+
+
+@pytest.fixture
+def stopped(scene, tmp_path, monkeypatch) -> Path:
+    """The folder of a fit that was interrupted after its first stage."""
+    from gshell_mi.fit import run
+
+    def interrupt(self):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run._Fit, "_ghost", interrupt)
+        assert main([str(scene), "-o", str(tmp_path / "out"), *SHORT]) == 130
+    return tmp_path / "out"
+
+
+def test_interrupt_says_how_to_go_on(scene, stopped, capfd):
+    assert (stopped / "checkpoint.npz").is_file()
+    assert not list(stopped.glob(".*"))
+
+
+def test_resume_with_other_settings(told, stopped):
+    assert "was made with max_depth = 2, not 3" in told("--resume", "--max-depth", "3")
+
+
+def test_damaged_checkpoint(told, stopped):
+    data = (stopped / "checkpoint.npz").read_bytes()
+    (stopped / "checkpoint.npz").write_bytes(data[: len(data) // 2])
+    assert f"'{stopped / 'checkpoint.npz'}' is damaged" in told("--resume")
+
+
+def test_checkpoint_of_another_version(told, stopped, monkeypatch):
+    monkeypatch.setattr("gshell_mi.fit.checkpoint.FORMAT", 99)
+    assert "written by another version" in told("--resume")
+
+
+def _full(*_, **__):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_disk_full_at_a_checkpoint(told, stopped, monkeypatch):
+    before = (stopped / "checkpoint.npz").read_bytes()
+    monkeypatch.setattr("numpy.savez", _full)
+    assert "No space left on device" in told("--resume", whole=True)
+    assert (stopped / "checkpoint.npz").read_bytes() == before, "the older one stays"
+    assert not list(stopped.glob(".*")), "no remains"
+
+
+@pytest.mark.parametrize("writer", ["_write_mesh", "_write_views"])
+def test_disk_full_at_export(told, scene, tmp_path, monkeypatch, writer):
+    output = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(f"gshell_mi.export.{writer}", _full)
+        assert "No space left on device" in told("--iterations", "1", whole=True)
+    assert not (output / "metrics.json").exists()
+    assert main([str(scene), "-o", str(output), *SHORT, "--iterations", "1",
+                 "--resume"]) == 0
+    assert (output / "metrics.json").is_file()
