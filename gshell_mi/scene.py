@@ -14,7 +14,7 @@ from .errors import UserError
 from .targets import Target, load_target
 
 #: Samples per pixel of targets rendered from a scene's reference.
-REFERENCE_SPP = 256
+REFERENCE_SPP = 128
 
 
 @dataclass(frozen=True)

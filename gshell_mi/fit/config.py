@@ -25,7 +25,7 @@ class FitConfig:
     """Keep the scene's light as it is instead of optimising it."""
 
     # --- visual hull
-    hull_daylight_votes: float = 0.06
+    hull_daylight_votes: float = 0.15
     """Fraction of the views that must see daylight at a point before an enclosed hole of the masks is carved."""
 
     # --- radiance ghost: finds the openings
@@ -37,17 +37,19 @@ class FitConfig:
     """Sheets of the template that a ray composites."""
     ghost_lr: float = 0.1
     """Adam's step for opacity logits and radiance; falls tenfold over the stage."""
-    ghost_smoothing: float = 60.0
+    ghost_smoothing: float = 2.0
     """Lambda of the Sobolev gradient (I + lambda L)^-1 on the template."""
-    ghost_mask: float = 0.01
+    ghost_mask: float = 0.003
     """Weight of the mask loss. The image loss also sees the mask; a large weight closes every cap before
     the images can open it."""
-    ghost_binary: float = 0.015
+    ghost_binary: float = 0.01
     """Final weight of the loss that makes opacity decide; ramps up over the second half."""
-    ghost_closing: float = 0.003
+    ghost_closing: float = 0.0005
     """Final weight of the loss that closes what the images leave undecided."""
     ghost_chroma: float = 0.003
     """Weight of the tie between the chroma of a sheet's two sides."""
+    ghost_gain: float = 0.8
+    """An opening stays if the image error through it is below this fraction of what it is when closed."""
     ghost_min_area: float = 0.005
     """Holes and islands smaller than this fraction of the template's area are noise and are undone."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,6 +15,9 @@ from ..topology import vertex_components
 
 #: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
 _CERTAIN = 3.0
+
+#: Logit of a vertex that is taken to be opaque (its negative: to be open).
+_CERTAIN_OPACITY = 8.0
 
 
 def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, min_area: float) -> np.ndarray:
@@ -31,17 +36,53 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
     face_area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     for corner in range(3):
         np.add.at(area, faces[:, corner], face_area / 3)
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     cleaned = logits.copy()
     # Cuts first: an island in a cut that closes is none.
     for flip_closed in (False, True):
         solid = cleaned > 0
-        same = solid[edges[:, 0]] == solid[edges[:, 1]]
-        _, patch = vertex_components(edges[same], len(vertices))
+        patch = _patches(solid, faces)
         small = np.bincount(patch, area)[patch] < min_area * area.sum()
         flip = small & (solid == flip_closed)
         cleaned[flip] = -cleaned[flip]
     return cleaned
+
+
+def close_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.ndarray], np.ndarray],
+                      gain: float) -> np.ndarray:
+    """Closes the openings through which the images are not explained better than by a closed template.
+
+    A hull that bulges over a fold, or a highlight, makes the views disagree on a vertex's radiance as a
+    cap does, and may open there. But the sheet behind such a hole is farther from the truth than the hull,
+    so the images disagree more.
+
+    Args:
+        logits: (V,) opacity logits; surface where positive.
+        faces: (F, 3) of the template.
+        error: maps logits to the (V,) image error through each vertex.
+        gain: an opening stays if the error through it is less than this fraction of the closed one's.
+
+    Returns:
+        (V,) logits, those of unjustified openings negated.
+    """
+    open_here = logits <= 0
+    if not open_here.any():
+        return logits
+    certain = np.full(len(logits), _CERTAIN_OPACITY)
+    closed_error = error(certain)
+    open_error = error(np.where(open_here, -certain, certain))
+    patch = _patches(open_here, faces)
+    ratio = np.bincount(patch, open_error)[patch] / np.maximum(np.bincount(patch, closed_error)[patch], 1e-12)
+    import os
+    if os.environ.get("DBG"):
+        for q in np.unique(patch[open_here]): print("patch", (patch==q).sum(), (np.bincount(patch, open_error)/np.maximum(np.bincount(patch, closed_error),1e-9))[q])
+    return np.where(open_here & (ratio > gain), -logits, logits)
+
+
+def _patches(label: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V,) ids of the connected patches of equal label."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    same = label[edges[:, 0]] == label[edges[:, 1]]
+    return vertex_components(edges[same], len(label))[1]
 
 
 def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: TetLattice) -> mi.Float:

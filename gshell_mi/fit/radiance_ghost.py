@@ -27,6 +27,11 @@ _INITIAL_OPACITY = 0.35
 
 _LOGIT_LIMIT = 3.0
 
+#: Steps that adapt the radiance to a given opacity, and steps that then measure the image error.
+_REFIT_STEPS, _ERROR_STEPS = 40, 20
+
+SIDES = ("front", "back")
+
 
 class RadianceGhost:
     """Opacity and two-sided radiance on a fixed mesh, trained on random pixels of all views.
@@ -59,13 +64,11 @@ class RadianceGhost:
         """One Adam step on a batch of random pixels; returns the losses."""
         config, optimizer = self.config, self.optimizer
         progress = iteration / config.ghost_iterations
-        sample = self.pixels.sample(config.ghost_batch, seed=config.seed, step=iteration)
-        radiance, alpha = self._composite(self._sheets(self.views.rays(sample.view, sample.film)))
+        sample, radiance, alpha, _ = self._render(iteration)
         image = losses.log_l1(radiance, sample.radiance)
         mask = losses.mask_l2(alpha, sample.alpha)
-
         opacity = _sigmoid(optimizer["opacity"])
-        front, back = (dr.unravel(mi.Color3f, _softplus(optimizer[side])) for side in ("front", "back"))
+        front, back = (dr.unravel(mi.Color3f, _softplus(optimizer[side])) for side in SIDES)
         # Undecided opacity must have its say first; only then is it made to decide.
         late = dr.opaque(mi.Float, max(0.0, 2 * progress - 1))
         total = (
@@ -76,14 +79,53 @@ class RadianceGhost:
             + config.ghost_chroma * losses.chroma_difference(front, back)
         )
         dr.backward(total)
-        optimizer.set_learning_rate(config.ghost_lr * 0.1**progress)
-        for name in ("opacity", "front", "back"):
-            parameter = optimizer[name]
-            dr.set_grad(parameter, self._smooth(dr.grad(parameter)))
-        optimizer.step()
+        self._update(("opacity", *SIDES), config.ghost_lr * 0.1**progress)
         error = dr.mean(dr.ravel(dr.square(dr.detach(radiance) - sample.radiance)))
         return {"loss": total[0], "image": image[0], "mask": mask[0],
                 "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
+
+    def image_error(self, logits: np.ndarray) -> np.ndarray:
+        """How badly the images are explained through each vertex if the opacity is ``logits``.
+
+        The radiance is refitted first, so that opacities can be compared that it was not trained for.
+
+        Returns:
+            (V,) sum of the image error over random rays by the vertices of the *first* sheet that they
+            meet, whether that sheet is opaque or not. Sums for different ``logits`` run over the same
+            rays, hence they compare patch by patch.
+        """
+        self.optimizer["opacity"] = mi.Float(logits.astype(np.float32))
+        rays = self.config.ghost_iterations
+        for step in range(_REFIT_STEPS):
+            sample, radiance, _, _ = self._render(rays + step)
+            dr.backward(losses.log_l1(radiance, sample.radiance))
+            self._update(SIDES, self.config.ghost_lr)
+        total = dr.zeros(mi.Float, self.vertex_count)
+        with dr.suspend_grad():
+            for step in range(_ERROR_STEPS):
+                sample, radiance, _, sheets = self._render(rays + _REFIT_STEPS + step)
+                difference = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
+                hit, face, weights, _ = sheets[0]
+                for corner in range(3):
+                    share = weights[corner] * (difference.x + difference.y + difference.z)
+                    dr.scatter_reduce(dr.ReduceOp.Add, total, share, face[corner], hit)
+                dr.eval(total)
+        return total.numpy()
+
+    def _render(self, step: int) -> tuple:
+        """The random pixels of a step, their radiance and coverage, and the sheets behind them."""
+        sample = self.pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
+        sheets = self._sheets(self.views.rays(sample.view, sample.film))
+        return sample, *self._composite(sheets), sheets
+
+    def _update(self, names: tuple[str, ...], rate: float) -> None:
+        """Steps the parameters ``names`` along their Sobolev gradients; the others rest."""
+        for name in ("opacity", *SIDES):
+            parameter = self.optimizer[name]
+            gradient = dr.grad(parameter)
+            dr.set_grad(parameter, self._smooth(gradient) if name in names else dr.zeros(mi.Float, dr.width(gradient)))
+        self.optimizer.set_learning_rate({name: rate if name in names else 0.0 for name in ("opacity", *SIDES)})
+        self.optimizer.step()
 
     def smoothed_logits(self) -> np.ndarray:
         """(V,) opacity logits, smoothed along the mesh; the surface is where they are positive.
@@ -91,7 +133,7 @@ class RadianceGhost:
         Only their sign is meant, so they are limited first: a very sure vertex must not outvote its
         neighbours when the rim is drawn between them.
         """
-        limited = dr.minimum(dr.maximum(dr.detach(self.optimizer["opacity"]), -_LOGIT_LIMIT), _LOGIT_LIMIT)
+        limited = dr.fmin(dr.fmax(dr.detach(self.optimizer["opacity"]), -_LOGIT_LIMIT), _LOGIT_LIMIT)
         return self._smooth(limited).numpy()
 
     def radiance(self) -> tuple[np.ndarray, np.ndarray]:
@@ -163,7 +205,7 @@ def _sigmoid(x):
 
 
 def _softplus(x):
-    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
+    return dr.fmax(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
 
 
 def _inverse_softplus(y: float) -> float:
