@@ -54,9 +54,9 @@ class FitConfig:
     """Holes and islands smaller than this fraction of the template's area are noise and are undone."""
 
     # --- joint stage: geometry, material and light by path tracing
-    iterations: int = 160
+    iterations: int = 200
     """Steps of the joint stage."""
-    warmup: float = 0.3
+    warmup: float = 0.15
     """Fraction of these steps in which only material and light move."""
     spp: int = 8
     """Samples per pixel of the gradient render."""
@@ -64,21 +64,24 @@ class FitConfig:
     """Samples per pixel of the image that the loss compares; independent of the gradient's samples."""
     max_depth: int = 3
     """Longest path: 2 is direct light, 3 adds one interreflection."""
-    geometry_lr: float = 0.01
+    geometry_lr: float = 0.05
     """Largest change of sdf and mSDF per step, in cells."""
-    deform_lr: float = 0.005
+    deform_lr: float = 0.02
     """Largest change of the vertex offsets per step; 1 is the greatest offset allowed."""
-    geometry_smoothing: float = 4.0
-    """Lambda of the Sobolev gradient (I + lambda L)^-1 on the lattice."""
+    geometry_smoothing: float = 8.0
+    """Lambda of the Sobolev gradient (I + lambda L)^-1 on the lattice when the geometry starts to move: whole
+    parts move first, details last."""
+    geometry_detail: float = 0.5
+    """Lambda at the end; falls geometrically."""
     material_gradient_smoothing: float = 1.0
     """Lambda of the material's Sobolev gradient on the lattice; spreads colour to what few pixels see."""
-    material_lr: float = 0.03
+    material_lr: float = 0.05
     """Adam's step for base colour, roughness and metallic (logits)."""
-    light_lr: float = 0.03
+    light_lr: float = 0.1
     """Adam's step for the environment map (logarithm of its radiance)."""
     light_height: int = 32
     """Rows of the optimised environment map; it has twice as many columns."""
-    joint_mask: float = 1.0
+    joint_mask: float = 4.0
     """Weight of the mask loss."""
     material_smoothness: float = 0.01
     """Weight of the difference between the material at a point and at a point nearby."""

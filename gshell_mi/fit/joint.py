@@ -65,9 +65,11 @@ class JointStage:
         mask = losses.mask_l2(image[..., 3], target[..., 3]) if self._has_alpha else mi.Float(0)
         total = color + config.joint_mask * mask + self._regularisation()
         dr.backward(total)
-        decay = 0.1 ** (iteration / max(config.iterations, 1))
+        progress = iteration / max(config.iterations, 1)
+        decay = 0.1**progress
         if moving:
-            self._step_geometry(decay)
+            ratio = config.geometry_detail / config.geometry_smoothing
+            self._step_geometry(decay, config.geometry_smoothing * ratio**progress)
         self._step_shading(decay)
         error = dr.mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]), axis=None)
         return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
@@ -109,13 +111,13 @@ class JointStage:
             total += config.light_grey * losses.grey_world(texels)
         return total
 
-    def _step_geometry(self, decay: float) -> None:
+    def _step_geometry(self, decay: float, smoothing: float) -> None:
         optimizer, config = self.geometry, self.config
         cell = self.subject.lattice.spacing
         for name in GEOMETRY:
             gradient = dr.grad(optimizer[name])
             gradient = dr.select(dr.isfinite(gradient), gradient, 0)
-            dr.set_grad(optimizer[name], self._diffuse(gradient, config.geometry_smoothing))
+            dr.set_grad(optimizer[name], self._diffuse(gradient, smoothing))
         rate = decay * config.geometry_lr * cell
         optimizer.set_learning_rate({"sdf": rate, "msdf": rate, "deform": decay * config.deform_lr})
         optimizer.step()
