@@ -61,6 +61,7 @@ def first_with_equal_key(keys, active):
         result = dr.select(done, found, result)
         slot = (slot + 1) & mask
         active &= ~done
+    dr.eval(result)     # what an atomic returned cannot be computed a second time
     return result
 
 
@@ -73,7 +74,7 @@ class EdgeTable:
     edge: object        #: ``UInt32``, 3F: representative directed edge
     forward: object     #: ``Bool``, 3F: whether it runs from the lower to the higher welded vertex
     valid: object       #: ``Bool``, 3F: false for the edges of degenerate faces
-    seam: object        #: ``Bool``, 3F: an end point is a duplicate of another vertex
+    split: object       #: ``Bool``, 3F: its faces have different copies of an end point (at representatives)
     degree: object      #: ``Int32``, 3F: number of faces at the edge, stored at its representative
 
     @property
@@ -110,10 +111,6 @@ def build_edge_table(positions, faces) -> EdgeTable:
     words = [dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, positions, 3 * vertex + k) + 0.0)
              for k in range(3)]
     welded = first_with_equal_key(words, dr.full(mi.Bool, True, vertex_count))
-    duplicates = dr.zeros(mi.UInt32, vertex_count)
-    dr.scatter_add(duplicates, mi.UInt32(1), welded)
-    dr.eval(welded, duplicates)
-
     corner = dr.arange(mi.UInt32, corner_count)
     face = corner // 3
     side = corner - 3 * face
@@ -124,12 +121,14 @@ def build_edge_table(positions, faces) -> EdgeTable:
     valid = (a != b) & (b != c) & (c != a)
     forward = a < b
     edge = first_with_equal_key([dr.minimum(a, b), dr.maximum(a, b)], valid)
-    seam = (dr.gather(mi.UInt32, duplicates, a) > 1) | (dr.gather(mi.UInt32, duplicates, b) > 1)
 
     degree = dr.zeros(mi.Int32, corner_count)
     dr.scatter_add(degree, mi.Int32(1), edge, valid)
-    dr.eval(start, end, edge, forward, valid, seam, degree)
-    return EdgeTable(start, end, edge, forward, valid, seam, degree)
+    copies = dr.zeros(mi.UInt32, corner_count)
+    dr.scatter_add(copies, start + end, edge, valid)
+    split = copies != (start + end) * mi.UInt32(degree)
+    dr.eval(start, end, edge, forward, valid, split, degree)
+    return EdgeTable(start, end, edge, forward, valid, split, degree)
 
 
 def scene_edge_tables(scene):

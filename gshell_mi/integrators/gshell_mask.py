@@ -14,7 +14,7 @@ class GShellMaskIntegrator(ADIntegrator):
     Colour and alpha are 1 on every shape and 0 elsewhere. The AOVs are the distance to the sensor
     (scene units) and the shading normal in world space, both 0 where nothing is hit.
 
-    Plugin parameters: ``warp_radius`` and ``cull_hidden``, as for ``gshell_path``.
+    Plugin parameters: ``warp_radius``, ``cull_hidden`` and ``crease_angle``, as for ``gshell_path``.
 
     .. code-block:: xml
 
@@ -29,6 +29,7 @@ class GShellMaskIntegrator(ADIntegrator):
         super().__init__(props)
         self.warp_radius = props.get("warp_radius", 2.0)
         self.cull_hidden = props.get("cull_hidden", True)
+        self.crease_angle = props.get("crease_angle", 10.0)
 
     def aov_names(self):
         return ["depth", "normal.x", "normal.y", "normal.z"]

@@ -5,7 +5,7 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from . import reparameterised_film
-from .light_edges import BATCH, sample_directions, shadow_points
+from .light_edges import BATCH, light_from_point, sample_directions, sample_points, shadow_points
 from .path_sample import PathSample
 from .path_vertex import material_point, mis_weight, sample_direct, segment
 
@@ -22,6 +22,7 @@ class GShellPathIntegrator(ADIntegrator):
         self.warp_radius = props.get("warp_radius", 2.0)
         self.cull_hidden = props.get("cull_hidden", True)
         self.reparam_depth = props.get("reparam_depth", 2)
+        self.crease_angle = props.get("crease_angle", 10.0)
         self.light_edge_samples = props.get("light_edge_samples", 1.0)
 
     # ------------------------------------------------------------------ rendering
@@ -115,33 +116,38 @@ class GShellPathIntegrator(ADIntegrator):
         film = sensor.film()
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(seed, BATCH)
+        batches = [sample_directions(scene, sampler) for _ in range(LIGHT_BATCHES)]
+        for batch in batches:
+            batch.weight /= LIGHT_BATCHES
+        batches += sample_points(scene, sampler)
         per_mesh = dr.prod(film.crop_size()) * self.light_edge_samples / (LIGHT_BATCHES * max(len(tables), 1))
-        for _ in range(LIGHT_BATCHES):
-            sources = sample_directions(scene, sampler)
+        for sources in batches:
             for mesh, table in tables:
                 for term in shadow_points(scene, sensor, mesh, table, sources, max(int(per_mesh), 1),
                                           sampler):
-                    direction = dr.gather(mi.Vector3f, dr.ravel(sources.position), term.source)
                     path_sampler = sampler.clone()
                     path_sampler.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)),
                                       dr.width(term.source))
-                    left, right = (self._reflected(scene, sensor, u, direction, path_sampler.clone())
-                                   for u in term.sides())
+                    left, right = (self._reflected(scene, sensor, u, sources, term.source,
+                                                   path_sampler.clone()) for u in term.sides())
                     term.jump = reparameterised_film.film_channels(film, left - right, mi.Float(0), [],
                                                                    mi.Color0f())
-                    term.weight /= LIGHT_BATCHES
                     dr.eval(term.jump)
                     yield term
 
-    def _reflected(self, scene, sensor, u, direction, sampler):
-        """Light from one direction that the surface seen at a film position reflects."""
+    def _reflected(self, scene, sensor, u, sources, index, sampler):
+        """Light of one light sample that the surface seen at a film position reflects."""
         position = u / mi.Vector2f(sensor.film().crop_size())
         ray, weight = sensor.sample_ray(sensor.shutter_open(), 0.0, position, mi.Point2f(0.5))
         si = self._first_hit(scene, ray).compute_surface_interaction(ray, mi.RayFlags.All)
-        value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), si.is_valid())
-        seen = si.is_valid() & (dr.max(mi.unpolarized_spectrum(value)) > 0)
-        arriving = self.primal(scene, sampler, si.spawn_ray(direction), seen, start=1)
-        return dr.select(seen, weight * value * arriving.value, 0)
+        active = si.is_valid()
+        if sources.is_point:
+            direction, arriving = light_from_point(scene, si, sources, index, active)
+        else:
+            direction = dr.gather(mi.Vector3f, dr.ravel(sources.position), index)
+            arriving = self.primal(scene, sampler, si.spawn_ray(direction), active, start=1).value
+        value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)
+        return dr.select(active, weight * value * arriving, 0)
 
     def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
         """Derivatives of camera paths.
@@ -150,7 +156,32 @@ class GShellPathIntegrator(ADIntegrator):
         derivative is that of the adjoint-weighted samples; in forward mode the channels' tangents and
         those of ``film_terms``.
         """
+        radiance, alpha, last, tail = self._first_vertices(scene, sampler, ray, state)
+        if mode == dr.ADMode.Backward:
+            total = on_sample(radiance, alpha, state.aovs)
+            if tail is not None:
+                with dr.suspend_grad():
+                    on_last = self._replay(mode, *tail, _adjoint_of_value(on_sample, state), mi.Vector3f(0))
+                total += dr.dot(last, on_last)
+            return total
+        # Interior gradients are results too, and the replay needs those of the inputs again.
+        dr.forward_to(radiance, alpha, last, *film_terms, flags=dr.ADFlag.ClearEdges)
+        tangent, alpha_tangent = dr.grad(radiance), mi.Float(dr.grad(alpha))
+        film_tangents = [dr.grad(x) for x in film_terms]
+        if tail is not None:
+            with dr.suspend_grad():
+                tangent += self._replay(mode, *tail, mi.Spectrum(0), mi.Vector3f(dr.grad(last)))
+        return on_sample(tangent, alpha_tangent, []), film_tangents
+
+    def _first_vertices(self, scene, sampler, ray, state):
+        """The first two vertices of each path, whose motions depend on each other, attached.
+
+        Returns radiance, coverage, the position of the second vertex and what the replay of the
+        remaining vertices takes, or ``None`` if the paths end here. Nothing else that is attached may
+        outlive this function: forward mode stumbles over dangling variables.
+        """
         surface_emitters = _has_surface_emitters(scene)
+        special = _has_bsdf_flag(scene, mi.BSDFFlags.Delta)
         context = mi.BSDFContext()
         deeper = self.max_depth > 3
         depth = mi.UInt32(0)
@@ -162,9 +193,8 @@ class GShellPathIntegrator(ADIntegrator):
         no_vertex = dr.zeros(mi.SurfaceInteraction3f)
         radiance = self._emission(scene, si, no_vertex, mi.Float(1), mi.Bool(True), depth, active)
         throughput = mi.Spectrum(1)     # of value 1, carries the derivatives of the vertices so far
-        beta, eta = mi.Spectrum(1), mi.Float(1)
+        beta, eta, alpha = mi.Spectrum(1), mi.Float(1), state.alpha
 
-        # Vertices whose motion depends on that of the one before are differentiated together.
         for vertex in range(min(self.max_depth - 1, 2)):
             active &= (depth + 1 < self.max_depth) & si.is_valid()
             si_now = dr.detach(si)
@@ -172,51 +202,65 @@ class GShellPathIntegrator(ADIntegrator):
                                                           surface_emitters)
             if vertex == 1 and not deeper:
                 break
+            choice, sample2 = sampler.next_1d(), sampler.next_2d()
             with dr.suspend_grad():
-                sample, weight = bsdf.sample(context, si_now, sampler.next_1d(), sampler.next_2d(), active)
+                sample, weight = bsdf.sample(context, si_now, choice, sample2, active)
                 ray_next = si_now.spawn_ray(si_now.to_world(sample.wo))
                 delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
                 eta *= sample.eta
                 beta, active = self._roulette(beta * weight, eta, depth, sampler, active)
                 pi = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active)
-            p_next, area_next = material_point(pi, ray_next, active)
-            d, solid_angle = segment(si.p, p_next, area_next, active & pi.is_valid(), ray_next.d)
-            value = bsdf.eval(context, si, si.to_local(d), active)
-            to_point = throughput * dr.relative_grad(value) * solid_angle
             depth = depth + 1
+            to_point = None
+            if surface_emitters or vertex == 1:
+                p_next, area_next = material_point(pi, ray_next, active)
+                d, solid_angle = segment(si.p, p_next, area_next, active & pi.is_valid(), ray_next.d)
+                value = bsdf.eval(context, si, si.to_local(d), active)
+                to_point = throughput * dr.relative_grad(value) * solid_angle
             if vertex == 1:
                 break
             # Light of emitters arrives from a point of theirs, all other along a fixed direction: in
             # these forms the integrand moves least, and emitter sampling uses the same.
             along = mi.Ray3f(ray_next)
             along.o = dr.replace_grad(ray_next.o, si.p)
+            change = dr.relative_grad(bsdf.eval(context, si, si.to_local(ray_next.d), active))
+            if special:
+                d, change, alpha = self._delta_lobe(bsdf, si, ray, ray_next, choice, sample2, delta, active,
+                                                    sample.sampled_type, change, alpha)
+                along.d = dr.replace_grad(ray_next.d, d)
+            throughput = throughput * change
             si_next = pi.compute_surface_interaction(along, mi.RayFlags.All, active)
             emitted = beta * self._emission(scene, si_next, si_now, sample.pdf, delta, depth, active)
-            value = bsdf.eval(context, si, si.to_local(ray_next.d), active)
-            throughput = throughput * dr.relative_grad(value)
-            radiance += dr.select(pi.is_valid(), to_point, throughput) * emitted
+            if surface_emitters:
+                emitted *= dr.select(pi.is_valid() & ~delta, to_point, throughput)
+            else:
+                emitted *= throughput
+            radiance += emitted
             si, bsdf = si_next, si_next.bsdf(mi.RayDifferential3f(dr.detach(ray_next)))
 
-        if deeper:
-            rest = state.value - dr.detach(radiance)
-            radiance += dr.select(active, to_point * rest, 0)
-            tail = (scene, sampler, ray_next, pi, si_now, rest, beta, eta, sample.pdf, delta, active, depth)
-        if mode == dr.ADMode.Backward:
-            total = on_sample(radiance, state.alpha, state.aovs)
-            if deeper:
-                with dr.suspend_grad():
-                    adjoint = _adjoint_of_value(on_sample, state)
-                    on_p = self._replay(mode, *tail, adjoint, mi.Vector3f(0))
-                total += dr.dot(si.p, on_p)
-            return total
-        # Interior gradients are results too, and the replay needs those of the inputs again.
-        dr.forward_to(radiance, si.p, *film_terms, flags=dr.ADFlag.ClearEdges)
-        tangent, p_tangent = dr.grad(radiance), mi.Vector3f(dr.grad(si.p))
-        film_tangents = [dr.grad(x) for x in film_terms]
-        if deeper:
-            with dr.suspend_grad():
-                tangent += self._replay(mode, *tail, mi.Spectrum(0), p_tangent)
-        return on_sample(tangent, mi.Float(0), []), film_tangents
+        if not deeper:
+            return radiance, alpha, dr.detach(si.p), None
+        rest = state.value - dr.detach(radiance)
+        radiance += dr.select(active, to_point * rest, 0)
+        return radiance, alpha, si.p, (scene, sampler, ray_next, pi, si_now, rest, beta, eta, sample.pdf,
+                                       delta, active, depth)
+
+    def _delta_lobe(self, bsdf, si, ray, ray_next, choice, sample2, delta, active, kind, change, alpha):
+        """Direction, relative weight and coverage where the first surface scatters in one direction.
+
+        A mirrored or refracted direction follows the surface, and one that passes through (``mask``)
+        the camera ray; the chance to pass is the opacity's complement.
+        """
+        context = mi.BSDFContext()
+        passes = active & mi.has_flag(kind, mi.BSDFFlags.Null)
+        sample, weight = bsdf.sample(context, si, choice, sample2, active)
+        transmission = bsdf.eval_null_transmission(si, active)
+        d = dr.select(passes, ray.d, dr.select(delta, si.to_world(sample.wo), ray_next.d))
+        change = dr.select(passes, dr.relative_grad(transmission),
+                           dr.select(delta, dr.relative_grad(weight), change))
+        opacity = 1 - dr.mean(mi.unpolarized_spectrum(transmission))
+        seen = dr.select(passes, dr.relative_grad(1 - opacity), dr.relative_grad(opacity))
+        return d, change, alpha * dr.select(active, seen, 1)
 
     @dr.syntax
     def _replay(self, mode, scene, sampler, ray, pi, si_prev, L, beta, eta, pdf_prev, delta_prev, active,
@@ -291,6 +335,11 @@ class GShellPathIntegrator(ADIntegrator):
 
 def _has_surface_emitters(scene):
     return any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in scene.emitters())
+
+
+def _has_bsdf_flag(scene, flag):
+    return any(shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), flag)
+               for shape in scene.shapes())
 
 
 def _adjoint_of_value(on_sample, state):

@@ -38,6 +38,13 @@ class LightSources:
     uv: object = None       #: ``Point2f``, 32: its texture coordinates there
 
 
+def _batch(x):
+    """Every source its own entry, even where all are equal, for gathers."""
+    x = x + dr.zeros(type(x), BATCH)
+    dr.make_opaque(x)
+    return x
+
+
 def sample_directions(scene, sampler):
     """Half of the directions from the environment's density, half uniform over the sphere."""
     it = dr.zeros(mi.Interaction3f, BATCH)
@@ -50,8 +57,8 @@ def sample_directions(scene, sampler):
     uniform = mi.warp.square_to_uniform_sphere(
         mi.Point2f((mi.Float(index % strata) + sample.x) / strata, sample.y))
     if environment is None:
-        return LightSources(mi.Vector3f(uniform), False, mi.Float(4 * dr.pi / BATCH),
-                            dr.ones(mi.Float, BATCH))
+        return LightSources(_batch(mi.Vector3f(uniform)), False, _batch(mi.Float(4 * dr.pi / BATCH)),
+                            _batch(mi.Float(1)))
     ds, _ = environment.sample_direction(it, sampler.next_2d())
     direction = dr.select(index < strata, ds.d, uniform)
     ds.d = direction
@@ -61,20 +68,21 @@ def sample_directions(scene, sampler):
     radiance = dr.mean(mi.unpolarized_spectrum(environment.eval(si)))
     weight = 1 / (BATCH * density)
     radiance = dr.maximum(radiance, 0.1 * dr.mean(radiance * weight) / (4 * dr.pi) * BATCH)
-    dr.eval(direction, weight, radiance)
-    return LightSources(direction, False, weight, radiance * weight)
+    return LightSources(_batch(direction), False, _batch(weight), _batch(radiance * weight))
 
 
-def sample_points(emitter, sampler):
-    """Points on an area light, or the position of a point or spot light."""
-    ones = dr.ones(mi.Float, BATCH)
-    if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
-        ps = emitter.shape().sample_position(0.0, sampler.next_2d())
-        dr.eval(ps)
-        return LightSources(mi.Vector3f(ps.p), True, dr.rcp(BATCH * ps.pdf), ones, emitter, ps.n, ps.uv)
-    ds, _ = emitter.sample_direction(dr.zeros(mi.Interaction3f, BATCH), sampler.next_2d())
-    dr.eval(ds)
-    return LightSources(mi.Vector3f(ds.p), True, ones / BATCH, ones, emitter)
+def sample_points(scene, sampler):
+    """For each area, point and spot light a batch of points on it."""
+    for shape in scene.shapes():
+        if shape.emitter() is not None:
+            ps = shape.sample_position(0.0, sampler.next_2d())
+            yield LightSources(_batch(mi.Vector3f(ps.p)), True, _batch(dr.rcp(BATCH * ps.pdf)),
+                               _batch(mi.Float(1)), shape.emitter(), _batch(ps.n), _batch(ps.uv))
+    for emitter in scene.emitters():
+        if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+            ds, _ = emitter.sample_direction(dr.zeros(mi.Interaction3f, BATCH), sampler.next_2d())
+            yield LightSources(_batch(mi.Vector3f(ds.p)), True, _batch(mi.Float(1 / BATCH)),
+                               _batch(mi.Float(1)), emitter)
 
 
 def light_from_point(scene, si, sources, index, active):

@@ -113,7 +113,8 @@ class Warp:
     def __init__(self, scene, tables, sensor, samples, integrator):
         self.film, self.radius = sensor.film(), integrator.warp_radius
         margin = self.radius + 2 - samples.origin[0]
-        self.edges = screen_edges(scene, tables, sensor, margin, cull=integrator.cull_hidden)
+        self.edges = screen_edges(scene, tables, sensor, margin, cull=integrator.cull_hidden,
+                                  crease_angle=integrator.crease_angle)
         self.grid = None
         with dr.resume_grad():
             moving = self.edges is not None and dr.grad_enabled((self.edges.a, self.edges.b))

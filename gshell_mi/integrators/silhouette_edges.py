@@ -52,6 +52,29 @@ def silhouette_mask(positions, faces, table, viewpoint):
     return (table.degree > 0) & (dr.abs(sides) == table.degree)
 
 
+def crease_mask(mesh, table, angle):
+    """Which directed edges carry a jump of the shading although both their faces are seen.
+
+    These are edges with a dihedral angle above ``angle`` (degrees) between flat-shaded faces, and
+    edges at which vertices are duplicated, so that normals or texture coordinates may jump.
+    """
+    flat = mesh.has_face_normals() or not mesh.has_vertex_normals()
+    positions, faces = dr.detach(mesh.vertex_positions_buffer()), mesh.faces_buffer()
+    n = dr.width(faces)
+    face = dr.arange(mi.UInt32, n) // 3
+    p0, p1, p2 = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k))
+                  for k in range(3))
+    normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
+    normal = dr.select(table.forward, normal, -normal)    # differ in sign where orientation agrees
+    total = dr.zeros(mi.Vector3f, n)
+    for k in range(3):
+        dr.scatter_add(total[k], normal[k], table.edge, table.valid)
+    sharp = (table.degree == 2) & (dr.squared_norm(total) > 2 - 2 * dr.cos(dr.deg2rad(angle)))
+    if flat:
+        return sharp
+    return table.split & (table.degree == 2) & (sharp | mesh.has_vertex_texcoords())
+
+
 def _clip(lo, hi, inside_a, inside_b):
     """Narrows the interval [lo, hi] of a segment to where the linear function is positive."""
     cut = inside_a / (inside_a - inside_b)
@@ -71,11 +94,11 @@ def _compact(selected, *arrays):
     return [dr.gather(type(x), x, index) for x in arrays]
 
 
-def _mesh_pieces(mesh, table, sensor, margin, piece_length, to_camera, near):
+def _mesh_pieces(mesh, table, sensor, crease_angle, margin, piece_length, to_camera, near):
     """The silhouette of one mesh in pieces: vertices of the edge, and the interval of it they span."""
     positions, faces = dr.detach(mesh.vertex_positions_buffer()), mesh.faces_buffer()
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
-    selected = silhouette_mask(positions, faces, table, viewpoint)
+    selected = silhouette_mask(positions, faces, table, viewpoint) | crease_mask(mesh, table, crease_angle)
     start, end = _compact(selected, table.start, table.end)
     if dr.width(start) == 0:
         return None
@@ -139,7 +162,7 @@ def _seen(scene, viewpoint, p, q):
     return seen
 
 
-def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True):
+def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True, crease_angle=10.0):
     """All silhouettes of the scene's meshes, projected and cut into short pieces.
 
     Parameters
@@ -154,6 +177,8 @@ def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True):
         Greatest length of a piece in pixels.
     cull:
         Leave out pieces that other surfaces hide.
+    crease_angle:
+        Dihedral angle in degrees from which an edge between flat-shaded faces counts.
 
     Returns
     -------
@@ -164,7 +189,7 @@ def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True):
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
     parts = []
     for shape, table in tables:
-        pieces = _mesh_pieces(shape, table, sensor, margin, piece_length, to_camera, near)
+        pieces = _mesh_pieces(shape, table, sensor, crease_angle, margin, piece_length, to_camera, near)
         if pieces is None:
             continue
         start, end, lo, hi = pieces
