@@ -70,16 +70,19 @@ def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray
         progress: called without arguments after each view.
 
     Returns:
-        One distance per point, world units. Points that no view frames are outside (+inf).
+        One distance per point, world units. A view whose mask keeps clear of the frame's border shows the
+        whole object, so it also carves what it does not frame; points that no view says anything of are
+        outside (+inf).
     """
     votes = max(2, round(daylight_votes * len(views)))
     carved = dr.full(mi.Float, -dr.inf, dr.width(points))
     # The largest distances to the unfilled masks, sorted: the last one has `votes` supporters.
     daylight = [dr.full(mi.Float, -dr.inf, dr.width(points)) for _ in range(votes)]
     for index, alpha in enumerate(alphas):
-        filled = plain = _cone_distance(points, views, index, mask_distance(alpha))
+        whole = not _touches_border(alpha)
+        filled = plain = _cone_distance(points, views, index, mask_distance(alpha), whole)
         if _has_holes(alpha):
-            plain = _cone_distance(points, views, index, mask_distance(alpha, fill_holes=False))
+            plain = _cone_distance(points, views, index, mask_distance(alpha, fill_holes=False), whole)
         carved = dr.maximum(carved, filled)
         for rank in range(votes):
             daylight[rank], plain = dr.maximum(daylight[rank], plain), dr.minimum(daylight[rank], plain)
@@ -95,8 +98,17 @@ def _has_holes(alpha: np.ndarray) -> bool:
     return bool((ndimage.binary_fill_holes(inside) & ~inside).any())
 
 
-def _cone_distance(points: mi.Point3f, views: PinholeViews, index: int, outline: np.ndarray) -> mi.Float:
-    """Distance to the cone over a mask, to first order; -inf where the view does not frame a point."""
+def _touches_border(alpha: np.ndarray) -> bool:
+    return bool(max(alpha[[0, -1]].max(), alpha[:, [0, -1]].max()) >= 0.5)
+
+
+def _cone_distance(points: mi.Point3f, views: PinholeViews, index: int, outline: np.ndarray,
+                   whole: bool) -> mi.Float:
+    """Distance to the cone over a mask, to first order.
+
+    Where the view does not frame a point it is -inf, unless the view shows the ``whole`` object: then
+    it is that at the frame's border, and behind the camera that to the cone's apex.
+    """
     height, width = outline.shape
     film, depth = views.project(index, points)
     # A finite stand-in keeps the interpolation next to an empty mask free of NaN.
@@ -104,5 +116,8 @@ def _cone_distance(points: mi.Point3f, views: PinholeViews, index: int, outline:
     texture = mi.Texture2f(mi.TensorXf(np.clip(outline, -diagonal, diagonal)[..., None].astype(np.float32)),
                            wrap_mode=dr.WrapMode.Clamp)
     pixel = float(np.linalg.norm(views.bases[index][:, 0]) / width)
+    distance = texture.eval(film)[0] * depth * pixel
+    if whole:
+        return dr.select(depth > 0, distance, dr.norm(points - mi.Point3f(views.origins[index])))
     framed = (depth > 0) & (film.x >= 0) & (film.x <= 1) & (film.y >= 0) & (film.y <= 1)
-    return dr.select(framed, texture.eval(film)[0] * depth * pixel, -dr.inf)
+    return dr.select(framed, distance, -dr.inf)
