@@ -16,9 +16,6 @@ from ..topology import vertex_components
 #: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
 _CERTAIN = 3.0
 
-#: Logit of a vertex that is taken to be opaque (its negative: to be open).
-_CERTAIN_OPACITY = 8.0
-
 
 def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, min_area: float) -> np.ndarray:
     """Undoes the cuts and the islands that are too small to be meant.
@@ -49,7 +46,7 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
 
 def close_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.ndarray], np.ndarray],
                       gain: float) -> np.ndarray:
-    """Closes the openings through which the images are not explained better than by a closed template.
+    """Closes the openings through which the images are not explained better than without them.
 
     A hull that bulges over a fold, or a highlight, makes the views disagree on a vertex's radiance as a
     cap does, and may open there. But the sheet behind such a hole is farther from the truth than the hull,
@@ -58,24 +55,19 @@ def close_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np
     Args:
         logits: (V,) opacity logits; surface where positive.
         faces: (F, 3) of the template.
-        error: maps logits to the (V,) image error through each vertex.
+        error: maps (V,) opaque or not to the (V,) image error through each vertex.
         gain: an opening stays if the error through it is less than this fraction of the closed one's.
 
     Returns:
         (V,) logits, those of unjustified openings negated.
     """
-    open_here = logits <= 0
-    if not open_here.any():
+    opened = logits <= 0
+    if not opened.any():
         return logits
-    certain = np.full(len(logits), _CERTAIN_OPACITY)
-    closed_error = error(certain)
-    open_error = error(np.where(open_here, -certain, certain))
-    patch = _patches(open_here, faces)
-    ratio = np.bincount(patch, open_error)[patch] / np.maximum(np.bincount(patch, closed_error)[patch], 1e-12)
-    import os
-    if os.environ.get("DBG"):
-        for q in np.unique(patch[open_here]): print("patch", (patch==q).sum(), (np.bincount(patch, open_error)/np.maximum(np.bincount(patch, closed_error),1e-9))[q])
-    return np.where(open_here & (ratio > gain), -logits, logits)
+    closed_error, open_error = error(np.ones_like(opened)), error(~opened)
+    patch = _patches(opened, faces)
+    before, after = (np.bincount(patch, e)[patch] for e in (closed_error, open_error))
+    return np.where(opened & (after > gain * before), -logits, logits)
 
 
 def _patches(label: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -21,14 +21,21 @@ from ..views import PinholeViews
 from .config import FitConfig
 from .pixels import PixelPool
 
-#: Every vertex starts here. Low enough that rays reach the sheets behind, high enough that all are
-#: seen; colours fitted at full opacity would bleed what is inside into the caps.
-_INITIAL_OPACITY = 0.35
+#: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
+#: enough that all are seen; colours fitted at full opacity would bleed what is inside into the caps.
+_INITIAL_LOGIT = float(np.log(0.35 / 0.65))
 
+#: Logit of a vertex that is taken to be opaque (its negative: to be open).
+_CERTAIN_LOGIT = 8.0
+
+#: Smoothed logits are limited to this.
 _LOGIT_LIMIT = 3.0
 
 #: Steps that adapt the radiance to a given opacity, and steps that then measure the image error.
 _REFIT_STEPS, _ERROR_STEPS = 40, 20
+
+#: Random pixels of these steps must not depend on how many training steps came before.
+_EXTRA_STEP = 1 << 20
 
 SIDES = ("front", "back")
 
@@ -55,10 +62,9 @@ class RadianceGhost:
         self._smoother = _sobolev_solver(faces, self.vertex_count, config.ghost_smoothing)
         grey = _inverse_softplus(pixels.mean_radiance())
         self.optimizer = mi.ad.Adam(lr=config.ghost_lr)
-        self.optimizer["opacity"] = dr.full(mi.Float, np.log(_INITIAL_OPACITY / (1 - _INITIAL_OPACITY)),
-                                            self.vertex_count)
-        self.optimizer["front"] = dr.full(mi.Float, grey, 3 * self.vertex_count)
-        self.optimizer["back"] = dr.full(mi.Float, grey, 3 * self.vertex_count)
+        for side in SIDES:
+            self.optimizer[side] = dr.full(mi.Float, grey, 3 * self.vertex_count)
+        self._set_opacity(np.full(self.vertex_count, _INITIAL_LOGIT))
 
     def step(self, iteration: int) -> dict[str, float]:
         """One Adam step on a batch of random pixels; returns the losses."""
@@ -84,26 +90,27 @@ class RadianceGhost:
         return {"loss": total[0], "image": image[0], "mask": mask[0],
                 "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
 
-    def image_error(self, logits: np.ndarray) -> np.ndarray:
-        """How badly the images are explained through each vertex if the opacity is ``logits``.
+    def refit(self, opaque: np.ndarray) -> None:
+        """Fits the radiance alone, with the vertices ``opaque`` (V,) opaque and the others open."""
+        self._set_opacity(np.where(opaque, _CERTAIN_LOGIT, -_CERTAIN_LOGIT))
+        for step in range(_REFIT_STEPS):
+            sample, radiance, _, _ = self._render(_EXTRA_STEP + step)
+            dr.backward(losses.log_l1(radiance, sample.radiance))
+            self._update(SIDES, self.config.ghost_lr)
 
-        The radiance is refitted first, so that opacities can be compared that it was not trained for.
+    def image_error(self, opaque: np.ndarray) -> np.ndarray:
+        """How badly the images are explained through each vertex if just the vertices ``opaque`` are.
 
         Returns:
             (V,) sum of the image error over random rays by the vertices of the *first* sheet that they
-            meet, whether that sheet is opaque or not. Sums for different ``logits`` run over the same
+            meet, whether that sheet is opaque or not. Sums for different opacities run over the same
             rays, hence they compare patch by patch.
         """
-        self.optimizer["opacity"] = mi.Float(logits.astype(np.float32))
-        rays = self.config.ghost_iterations
-        for step in range(_REFIT_STEPS):
-            sample, radiance, _, _ = self._render(rays + step)
-            dr.backward(losses.log_l1(radiance, sample.radiance))
-            self._update(SIDES, self.config.ghost_lr)
+        self.refit(opaque)
         total = dr.zeros(mi.Float, self.vertex_count)
         with dr.suspend_grad():
             for step in range(_ERROR_STEPS):
-                sample, radiance, _, sheets = self._render(rays + _REFIT_STEPS + step)
+                sample, radiance, _, sheets = self._render(_EXTRA_STEP + _REFIT_STEPS + step)
                 difference = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
                 hit, face, weights, _ = sheets[0]
                 for corner in range(3):
@@ -111,6 +118,11 @@ class RadianceGhost:
                     dr.scatter_reduce(dr.ReduceOp.Add, total, share, face[corner], hit)
                 dr.eval(total)
         return total.numpy()
+
+    def _set_opacity(self, logits: np.ndarray) -> None:
+        """New logits, and an optimiser without memory of what led to the old ones."""
+        self.optimizer["opacity"] = mi.Float(logits.astype(np.float32))
+        self.optimizer.reset()
 
     def _render(self, step: int) -> tuple:
         """The random pixels of a step, their radiance and coverage, and the sheets behind them."""

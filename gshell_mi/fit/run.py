@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
@@ -140,19 +141,22 @@ class _Fit:
         template = self.scene.subject.template()
         vertices, faces, _ = template.to_numpy()
         ghost = RadianceGhost(vertices, faces, self.views, PixelPool(self.views, self.scene.targets), self.config)
-        self._iterate("ghost", self.config.ghost_iterations, ghost.step, {"ghost": ghost.optimizer},
-                      {"sdf": sdf})
-        logits = clean_opacity(ghost.smoothed_logits(), vertices, faces, self.config.ghost_min_area)
+        self._iterate("ghost", self.config.ghost_iterations, ghost.step, {"ghost": ghost.optimizer}, {"sdf": sdf})
+        clean = partial(clean_opacity, vertices=vertices, faces=faces, min_area=self.config.ghost_min_area)
         with self.progress.stage("openings", None), self._timed("ghost"):
-            logits = close_unjustified(logits, faces, ghost.image_error, self.config.ghost_gain)
-        msdf = msdf_from_template(logits, template, self.lattice)
-        if not (logits > 0).any():
+            logits = close_unjustified(clean(ghost.smoothed_logits()), faces, ghost.image_error,
+                                       self.config.ghost_gain)
+            logits = clean(logits)
+            opened = logits <= 0
+            ghost.refit(~opened)
+        if opened.all():
             raise UserError(f"The radiance ghost found nothing opaque in '{self.scene.path}'; give it more steps "
                             f"with --ghost-iterations, or check the cameras.")
         front, _ = ghost.radiance()
+        msdf = msdf_from_template(logits, template, self.lattice)
         radiance, known = splat_to_lattice(mi.Float(front.ravel()), template, self.lattice)
         radiance = radiance.numpy().reshape(-1, 3)
-        light = float(np.median(front[logits > 0].mean(axis=1)))
+        light = float(np.median(front[~opened].mean(axis=1)))
         self._enter("joint", sdf=sdf, msdf=msdf.numpy(), radiance=radiance, known=known.numpy(),
                     light=np.float32(light / _TYPICAL_REFLECTANCE))
 
