@@ -15,7 +15,7 @@ _EMPTY = 0xFFFFFFFF
 
 @dr.syntax
 def first_with_equal_key(keys, active):
-    """For each entry the index of one entry, the same for all, that has an equal key.
+    """For each entry the index of the first entry that has an equal key.
 
     Parameters
     ----------
@@ -26,13 +26,12 @@ def first_with_equal_key(keys, active):
 
     Returns
     -------
-    ``UInt32``, width ``n``. Which of several equal entries represents them depends on the order in
-    which threads run.
+    ``UInt32``, width ``n``.
 
     >>> key = mi.UInt32(7, 5, 7, 9)
     >>> r = first_with_equal_key([key], mi.Bool(True, True, True, False))
-    >>> bool(r[0] == r[2] and r[0] in (0, 2)), r[1], r[3] == 0xFFFFFFFF
-    (True, 1, True)
+    >>> r[0], r[1], r[2], r[3] == 0xFFFFFFFF
+    (0, 1, 0, True)
     """
     n = dr.width(keys[0])
     active = mi.Bool(active)
@@ -62,7 +61,10 @@ def first_with_equal_key(keys, active):
         slot = (slot + 1) & mask
         active &= ~done
     dr.eval(result)     # what an atomic returned cannot be computed a second time
-    return result
+    lowest = dr.full(mi.UInt32, _EMPTY, n)
+    taking_part = result != _EMPTY
+    dr.scatter_reduce(dr.ReduceOp.Min, lowest, index, result, taking_part)
+    return dr.select(taking_part, dr.gather(mi.UInt32, lowest, result, taking_part), _EMPTY)
 
 
 @dataclass

@@ -124,30 +124,48 @@ class GShellPathIntegrator(ADIntegrator):
         for sources in batches:
             for mesh, table in tables:
                 for term in shadow_points(scene, sensor, mesh, table, sources, max(int(per_mesh), 1),
-                                          sampler):
+                                          sampler, int(min(self.reparam_depth, self.max_depth) > 2)):
                     path_sampler = sampler.clone()
                     path_sampler.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)),
                                       dr.width(term.source))
-                    left, right = (self._reflected(scene, sensor, u, sources, term.source,
-                                                   path_sampler.clone()) for u in term.sides())
-                    term.jump = reparameterised_film.film_channels(film, left - right, mi.Float(0), [],
-                                                                   mi.Color0f())
+                    left, right = (self._reflected(scene, sensor, u, sources, term, path_sampler.clone())
+                                   for u in term.sides())
+                    both = left[1] & right[1]
+                    term.jump = reparameterised_film.film_channels(
+                        film, dr.select(both, left[0] - right[0], 0), mi.Float(0), [], mi.Color0f())
                     dr.eval(term.jump)
                     yield term
 
-    def _reflected(self, scene, sensor, u, sources, index, sampler):
-        """Light of one light sample that the surface seen at a film position reflects."""
+    def _reflected(self, scene, sensor, u, sources, term, sampler):
+        """Light of one light sample that is seen at a film position, and whether that makes sense."""
         position = u / mi.Vector2f(sensor.film().crop_size())
-        ray, weight = sensor.sample_ray(sensor.shutter_open(), 0.0, position, mi.Point2f(0.5))
+        ray, throughput = sensor.sample_ray(sensor.shutter_open(), 0.0, position, mi.Point2f(0.5))
+        context = mi.BSDFContext()
         si = self._first_hit(scene, ray).compute_surface_interaction(ray, mi.RayFlags.All)
         active = si.is_valid()
+        direct = term.via is None
+        if not direct:
+            throughput = throughput * si.bsdf().eval(context, si, si.to_local(term.via), active)
+            distance = dr.norm(term.lit - si.p)
+            si = scene.ray_intersect(si.spawn_ray(term.via), active)
+            # Where the two sides see different surfaces, the silhouette of one of them is between
+            # them, and the light of the other kind of boundary term counts it.
+            active &= si.is_valid() & (dr.norm(si.p - term.lit) < 0.02 * distance + 1e-3)
         if sources.is_point:
-            direction, arriving = light_from_point(scene, si, sources, index, active)
+            direction, arriving = light_from_point(scene, si, sources, term.source, active)
         else:
-            direction = dr.gather(mi.Vector3f, dr.ravel(sources.position), index)
-            arriving = self.primal(scene, sampler, si.spawn_ray(direction), active, start=1).value
-        value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)
-        return dr.select(active, weight * value * arriving, 0)
+            direction = dr.gather(mi.Vector3f, dr.ravel(sources.position), term.source)
+            ray = si.spawn_ray(direction)
+            if direct:
+                arriving = self.primal(scene, sampler, ray, active, start=1).value
+            elif scene.environment() is None:
+                arriving = mi.Spectrum(0)
+            else:
+                sky = dr.zeros(mi.SurfaceInteraction3f, dr.width(u))
+                sky.wi = -direction
+                arriving = dr.select(scene.ray_test(ray, active), 0, scene.environment().eval(sky))
+        value = throughput * si.bsdf().eval(context, si, si.to_local(direction), active) * arriving
+        return dr.select(active, value, 0), active | mi.Bool(direct)
 
     def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
         """Derivatives of camera paths.

@@ -198,6 +198,8 @@ class BoundaryTerm:
     tangent: object     #: ``Vector2f``: its derivative along the edge
     source: object      #: ``UInt32``: which light sample casts the shadow
     weight: object      #: ``Float``
+    via: object = None      #: ``Vector3f``: direction from the visible surface to the one in question
+    lit: object = None      #: ``Point3f``: the point there on the boundary of the shadow
     jump: object = None     #: per film channel, the value on the left of the tangent less the other
 
     @property
@@ -217,88 +219,100 @@ class BoundaryTerm:
         return self.weight * (self.tangent.y * motion.x - self.tangent.x * motion.y)
 
 
-def shadow_points(scene, sensor, mesh, table, sources, samples, sampler):
+def shadow_points(scene, sensor, mesh, table, sources, samples, sampler, bounces):
     """Draws points on the shadow boundaries that a mesh causes, and yields those that are seen.
 
     There are two kinds: the shadows that the edges cast, and the edges themselves, where the mesh
-    turns away from the light (its shading normals do so elsewhere, so the light jumps there).
+    turns away from the light (its shading normals do so elsewhere, so the light jumps there). Both
+    are seen directly and, with ``bounces`` = 1, also in the light that the surface behind a camera
+    ray receives from there.
     """
     drawn = _sample_edges(mesh, table, sources, samples, sampler)
     if drawn is None:
         return
-    fraction = sampler.clone()
-    fraction.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)), dr.width(drawn[0]))
-    drawn = (*drawn, fraction.next_1d())
+    random = sampler.clone()
+    random.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)), dr.width(drawn[0]))
+    drawn = (*drawn, random.next_1d(), random.next_2d())
     dr.eval(drawn)
-    for cast in (True, False):
-        term = _seen_points(scene, sensor, mesh, sources, drawn, cast)
-        if term is not None:
-            yield term
+    for bounce in range(bounces + 1):
+        for cast in (True, False):
+            term = _seen_points(scene, sensor, mesh, sources, drawn, cast, bounce)
+            if term is not None:
+                yield term
 
 
-def _edge_points(positions, sources, start, end, source, t):
-    """Edge vectors, points and unit directions to the light; attached if the positions are."""
-    p, q = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
-    y = mi.Point3f(dr.lerp(p, q, t))
-    z = dr.gather(mi.Vector3f, dr.ravel(sources.position), source)
-    return q - p, y, dr.normalize(z - y) if sources.is_point else z
+def _project_along(scene, p, towards):
+    """The next surface from a point away from ``towards``: hit point, normal, validity; attached."""
+    lift = 1e-4 * (1 + dr.max(dr.abs(dr.detach(p))))
+    ray = mi.Ray3f(mi.Point3f(p - towards * lift), -towards)
+    with dr.suspend_grad():
+        pi = scene.ray_intersect_preliminary(dr.detach(ray))
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+    return mi.Point3f(si.p), dr.detach(si.n), pi.is_valid()
 
 
-def _shadow_ray(y, towards):
-    """Ray away from the light that starts just behind an edge point."""
-    lift = 1e-4 * (1 + dr.max(dr.abs(dr.detach(y))))
-    return mi.Ray3f(mi.Point3f(y - towards * lift), -towards)
+def _slide(vector, normal, along):
+    """The vector projected along a direction on the plane with the given normal."""
+    return vector - along * (dr.dot(normal, vector) / dr.dot(normal, along))
 
 
-def _seen_points(scene, sensor, mesh, sources, drawn, cast):
-    film = sensor.film()
-    start, end, source, weight, t = drawn
-    _, y, towards = _edge_points(dr.detach(mesh.vertex_positions_buffer()), sources, start, end, source, t)
-    p, hit = y, mi.Bool(True)
+def _follow(scene, mesh, sources, start, end, source, t, via, cast, bounce):
+    """From points on edges to what a camera may see of their shadow.
+
+    Returns the visible point and the shadow point, attached; the derivative of the former along the
+    edge; and whether there is one.
+    """
+    positions = mesh.vertex_positions_buffer()
+    a, b = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
+    p = mi.Point3f(dr.lerp(a, b, t))
+    along, valid = dr.detach(b - a), mi.Bool(True)
     if cast:
-        ray = _shadow_ray(y, towards)
-        pi = scene.ray_intersect_preliminary(ray)
-        p, hit = mi.Point3f(ray(pi.t)), pi.is_valid()
+        y, z = p, dr.gather(mi.Vector3f, dr.ravel(sources.position), source)
+        towards = dr.normalize(mi.Point3f(z) - y) if sources.is_point else z
+        p, normal, valid = _project_along(scene, y, towards)
+        if sources.is_point:
+            along *= dr.norm(dr.detach(p) - z) / dr.norm(dr.detach(y) - z)
+        along = _slide(along, normal, dr.detach(towards))
+    lit = p
+    if bounce:
+        p, normal, hit = _project_along(scene, p, via)
+        along = _slide(along, normal, via)
+        valid &= hit
+    return p, lit, along, valid
+
+
+def _seen_points(scene, sensor, mesh, sources, drawn, cast, bounce):
+    film = sensor.film()
+    *drawn, weight, t, sample = drawn
+    via = mi.warp.square_to_uniform_sphere(sample)
+    if bounce:
+        weight = weight * (4 * dr.pi)
+    p, lit, _, seen = _follow(scene, mesh, sources, *drawn, t, via, cast, bounce)
     # The camera has to see the point, and the film to cover it.
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
     offset = p - viewpoint
     distance = dr.norm(offset)
-    hit &= (dr.detach(sensor.world_transform()).inverse() @ p).z > sensor.near_clip()
+    seen &= (dr.detach(sensor.world_transform()).inverse() @ p).z > sensor.near_clip()
     c = project_to_film(sensor, p)
     border = film.rfilter().border_size() if film.sample_border() else 0
-    hit &= dr.all((c > -border) & (c < mi.Point2f(film.crop_size()) + border))
-    hit &= ~scene.ray_test(mi.Ray3f(viewpoint, offset / distance, distance * (1 - 1e-3), 0.0, mi.Color0f()),
-                           hit)
-    kept = dr.compress(hit)
+    seen &= dr.all((c > -border) & (c < mi.Point2f(film.crop_size()) + border))
+    seen &= ~scene.ray_test(mi.Ray3f(viewpoint, offset / distance, distance * (1 - 1e-3), 0.0, mi.Color0f()),
+                            seen)
+    kept = dr.compress(seen)
     if dr.width(kept) == 0:
         return None
-    start, end, source, weight, t = (dr.gather(type(x), x, kept) for x in drawn)
-    dr.eval(start, end, source, weight, t)
+    start, end, source = (dr.gather(mi.UInt32, x, kept) for x in drawn)
+    weight, t = dr.gather(mi.Float, weight, kept), dr.gather(mi.Float, t, kept)
+    via = mi.warp.square_to_uniform_sphere(dr.gather(mi.Point2f, dr.ravel(sample), kept))
+    dr.eval(start, end, source, weight, t, via)
 
     with dr.resume_grad():
-        edge, y, towards = _edge_points(mesh.vertex_positions_buffer(), sources, start, end, source, t)
-        p = y
-        if cast:
-            ray = _shadow_ray(y, towards)
-            with dr.suspend_grad():
-                pi = scene.ray_intersect_preliminary(dr.detach(ray))
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
-            p = si.p
+        p, lit, along, valid = _follow(scene, mesh, sources, start, end, source, t, via, cast, bounce)
         moving = project_to_film(sensor, p)
-    edge, y, p, towards = dr.detach(edge), dr.detach(y), dr.detach(p), dr.detach(towards)
-    if cast:
-        # Along the edge, the shadow moves by the edge vector projected along the light.
-        if sources.is_point:
-            z = mi.Point3f(dr.gather(mi.Vector3f, dr.ravel(sources.position), source))
-            edge *= dr.norm(p - z) / dr.norm(y - z)
-        normal = dr.detach(si.n)
-        edge -= towards * (dr.dot(normal, edge) / dr.dot(normal, towards))
-    step = 1e-3 * dr.norm(p - viewpoint) / dr.maximum(dr.norm(edge), 1e-20)
-    with dr.suspend_grad():
-        tangent = mi.Vector2f(project_to_film(sensor, p + edge * step) -
-                              project_to_film(sensor, p - edge * step)) / (2 * step)
-    usable = dr.isfinite(dr.squared_norm(tangent)) & (dr.squared_norm(tangent) > 0)
-    if cast:
-        usable &= pi.is_valid()
+    p = dr.detach(p)
+    step = 1e-3 * dr.norm(p - viewpoint) / dr.maximum(dr.norm(along), 1e-20)
+    tangent = mi.Vector2f(project_to_film(sensor, p + along * step) -
+                          project_to_film(sensor, p - along * step)) / (2 * step)
+    usable = valid & dr.isfinite(dr.squared_norm(tangent)) & (dr.squared_norm(tangent) > 0)
     return BoundaryTerm(moving, dr.select(usable, tangent, mi.Vector2f(1, 0)), source,
-                        dr.select(usable, weight, 0))
+                        dr.select(usable, weight, 0), via if bounce else None, dr.detach(lit))
