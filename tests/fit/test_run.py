@@ -1,0 +1,217 @@
+"""The fit from start to end on the bowl: what it leaves behind, what it may read, what a kill costs."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from bowl import RADIUS, SHORT, SIZE, VIEWS, write_scene
+from scipy.spatial import cKDTree
+from topology import assert_manifold, loop_count
+
+from gshell_mi.fit.__main__ import main
+
+
+def fit(scene: Path, output: Path, *arguments: str) -> int:
+    return main([str(scene), "-o", str(output), "--quiet", *SHORT, *arguments])
+
+
+def start(scene: Path, output: Path, *arguments: str) -> subprocess.Popen:
+    """The command in a process of its own, to be killed."""
+    code = ("import sys, drjit as dr; from gshell_mi.fit.__main__ import main; "
+            f"dr.set_thread_count({dr.thread_count()}); sys.exit(main(sys.argv[1:]))")
+    command = [sys.executable, "-c", code, str(scene), "-o", str(output), *SHORT, *arguments]
+    # A shell starts background jobs with Ctrl-C ignored, and tests may run in one.
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+                            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+
+
+def wait_for_step(process: subprocess.Popen, output: Path, stage: str, iteration: int) -> None:
+    """Returns as soon as the log has the step."""
+    line, log = f'{{"stage": "{stage}", "iteration": {iteration},', output / "log.jsonl"
+    deadline = time.monotonic() + 300
+    while not (log.exists() and line in log.read_text()):
+        assert process.poll() is None, f"ended before the step: {process.stderr.read()}"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def steps(output: Path) -> list[tuple[str, int]]:
+    return [(step["stage"], step["iteration"])
+            for step in map(json.loads, (output / "log.jsonl").read_text().splitlines())]
+
+
+def mesh(output: Path) -> trimesh.Trimesh:
+    return trimesh.load(output / "mesh.ply", process=False)
+
+
+def hausdorff(first: Path, second: Path) -> float:
+    """Largest distance from a vertex of one mesh to the nearest of the other, in lattice units."""
+    a, b = mesh(first).vertices, mesh(second).vertices
+    return max(cKDTree(a).query(b)[0].max(), cKDTree(b).query(a)[0].max())
+
+
+@pytest.fixture(scope="module")
+def whole(bowl_scene, tmp_path_factory) -> Path:
+    """The folder of a fit that nothing interrupted."""
+    output = tmp_path_factory.mktemp("whole") / "out"
+    assert fit(bowl_scene, output) == 0
+    return output
+
+
+def test_folder_is_complete(whole):
+    expected = {"scene.xml", "mesh.ply", "template.ply", "light.exr", "metrics.json", "log.jsonl",
+                "checkpoint.npz", "views"}
+    assert expected <= {path.name for path in whole.iterdir()}
+    assert not list(whole.glob(".*")), "no partial files"
+    assert {path.stem for path in (whole / "views").iterdir()} == {f"view_{i:03}" for i in range(VIEWS)}
+
+
+def test_the_bowl_is_open(whole):
+    found = mesh(whole)
+    assert_manifold(found.vertices, found.faces)
+    assert loop_count(found.faces) == 1
+    radius = np.linalg.norm(found.vertices, axis=1)
+    assert np.median(np.abs(radius - RADIUS)) < 0.05, "half a cell"
+    assert found.vertices[:, 1].max() < 0.15
+    template = trimesh.load(whole / "template.ply", process=False)
+    assert template.is_watertight
+
+
+def test_metrics(whole):
+    metrics = json.loads((whole / "metrics.json").read_text())
+    found = mesh(whole)
+    assert metrics["counts"]["vertices"] == len(found.vertices)
+    assert metrics["counts"]["faces"] == len(found.faces)
+    assert metrics["counts"]["boundary_loops"] == 1
+    assert metrics["counts"]["nonmanifold_edges"] == 0
+    per_view = list(metrics["psnr_per_view"].values())
+    assert metrics["psnr_training"] == pytest.approx(np.mean(per_view), abs=1e-2)
+    assert metrics["psnr_training"] > 15
+    assert metrics["config"]["ghost_iterations"] == 100 and metrics["config"]["seed"] == 0
+    assert metrics["versions"]["mitsuba"] == mi.__version__
+    assert {"hull", "ghost", "joint", "total"} <= set(metrics["seconds"])
+
+
+def test_log_has_a_line_per_step(whole):
+    assert steps(whole) == [("ghost", i) for i in range(100)] + [("joint", i) for i in range(12)]
+    losses = [json.loads(line)["image"] for line in (whole / "log.jsonl").read_text().splitlines()]
+    assert np.mean(losses[90:100]) < 0.7 * np.mean(losses[:10]), "the ghost learns"
+
+
+def test_exported_scene_renders_without_the_package(whole):
+    code = f"""if True:
+        import sys
+        import mitsuba as mi, numpy as np
+        mi.set_variant("llvm_ad_rgb")
+        scene = mi.load_file({str(whole / 'scene.xml')!r})
+        image = np.array(mi.render(scene, spp=16))
+        assert image.shape == ({SIZE}, {SIZE}, 4) and np.isfinite(image).all()
+        assert 0.05 < image[..., 3].mean() < 0.6, "the object is seen, and the light behind it is not"
+        assert image[..., :3].max() > 0.05
+        assert "gshell_mi" not in sys.modules
+    """
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=whole)
+
+
+def test_known_light_is_left_alone(bowl_scene, tmp_path):
+    assert fit(bowl_scene, tmp_path / "out", "--known-light", "--iterations", "2") == 0
+    light = np.array(mi.Bitmap(str(tmp_path / "out" / "light.exr")))
+    np.testing.assert_allclose(light, 1, rtol=1e-3)
+
+
+def test_without_alpha(bowl_scene, tmp_path, capfd):
+    shutil.copytree(bowl_scene.parent, tmp_path / "in")
+    scene = tmp_path / "in" / bowl_scene.name
+    for path in scene.with_suffix("").glob("*.exr"):
+        pixels = np.array(mi.Bitmap(str(path)))
+        mi.Bitmap(np.ascontiguousarray(pixels[..., :3])).write(str(path))
+    assert main([str(scene), "-o", str(tmp_path / "out"), *SHORT, "--iterations", "2"]) == 0
+    told = " ".join(capfd.readouterr().err.split())
+    assert "warning: some targets have no alpha: coverage is taken as 1 and the mask losses are off." in told
+    log = map(json.loads, (tmp_path / "out" / "log.jsonl").read_text().splitlines())
+    assert all(step["mask"] == 0 for step in log if step["stage"] == "joint")
+
+
+def test_camera_inside_the_box(bowl_scene, tmp_path):
+    shutil.copytree(bowl_scene.parent, tmp_path / "in")
+    scene = tmp_path / "in" / bowl_scene.name
+    resolution = '<integer name="resolution" value="20"/>'
+    box = resolution + '<transform name="to_world"> <scale value="3.5"/> </transform>'
+    scene.write_text(scene.read_text().replace(resolution, box))
+    assert fit(scene, tmp_path / "out", "--iterations", "0") == 0
+    assert np.abs(mesh(tmp_path / "out").vertices).max() < 1, "nothing is left around the cameras"
+
+
+def test_reads_the_reference_only_for_missing_targets(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path)
+    targets = scene.with_suffix("")
+    for name in ("truth.ply", "reference.xml"):
+        assert (targets / name).is_file()
+    monkeypatch.setattr("gshell_mi.scene.REFERENCE_SPP", 4)
+    assert fit(scene, tmp_path / "out", "--iterations", "0") == 0
+    rendered = {path.name: path.read_bytes() for path in targets.glob("*.exr")}
+    assert set(rendered) == {f"view_{i:03}.exr" for i in range(VIEWS)}
+
+    # With all targets there, nonsense in its place does no harm.
+    (targets / "reference.xml").write_text("no scene at all")
+    (targets / "truth.ply").write_text("no mesh at all")
+    assert fit(scene, tmp_path / "again", "--iterations", "0") == 0
+    assert rendered == {path.name: path.read_bytes() for path in targets.glob("*.exr")}
+
+    (targets / "view_005.exr").unlink()
+    assert fit(scene, tmp_path / "third", "--iterations", "0") == 2
+
+
+def test_interrupted_by_the_user(bowl_scene, tmp_path):
+    output = tmp_path / "out"
+    process = start(bowl_scene, output, "--checkpoint-seconds", "0")
+    wait_for_step(process, output, "ghost", 5)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "continue with --resume" in told and "Traceback" not in told
+    assert not list(output.glob(".*")) and (output / "checkpoint.npz").is_file()
+    assert fit(bowl_scene, output, "--resume") == 0
+    assert len(steps(output)) == 112
+
+
+@pytest.fixture
+def one_thread():
+    """Sums over several threads depend on their order, and rounding grows from step to step."""
+    count = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    dr.set_thread_count(count)
+
+
+@pytest.mark.slow
+def test_killed_and_resumed(bowl_scene, one_thread, tmp_path, record_property):
+    """Killed once in each stage, the fit ends as if it had not been."""
+    whole = tmp_path / "whole"
+    assert fit(bowl_scene, whole) == 0
+    killed = tmp_path / "killed"
+    for stage, iteration, resume in (("ghost", 30, ()), ("joint", 6, ("--resume",))):
+        process = start(bowl_scene, killed, "--checkpoint-seconds", "0.05", *resume)
+        wait_for_step(process, killed, stage, iteration)
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+        assert not (killed / "mesh.ply").exists()
+    assert fit(bowl_scene, killed, "--resume") == 0
+    assert steps(killed) == steps(whole), "no step is missing and none is logged twice"
+
+    again = tmp_path / "again"
+    assert fit(bowl_scene, again) == 0
+    between_whole_runs, to_killed = hausdorff(whole, again), hausdorff(whole, killed)
+    record_property("hausdorff of two whole runs", between_whole_runs)
+    record_property("hausdorff of a whole and a killed run", to_killed)
+    assert to_killed <= max(between_whole_runs, 1e-5)
