@@ -145,7 +145,7 @@ class RadianceGhost:
         Only their sign is meant, so they are limited first: a very sure vertex must not outvote its
         neighbours when the rim is drawn between them.
         """
-        limited = dr.fmin(dr.fmax(dr.detach(self.optimizer["opacity"]), -_LOGIT_LIMIT), _LOGIT_LIMIT)
+        limited = dr.minimum(dr.maximum(dr.detach(self.optimizer["opacity"]), -_LOGIT_LIMIT), _LOGIT_LIMIT)
         return self._smooth(limited).numpy()
 
     def radiance(self) -> tuple[np.ndarray, np.ndarray]:
@@ -217,7 +217,7 @@ def _sigmoid(x):
 
 
 def _softplus(x):
-    return dr.fmax(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
+    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
 
 
 def _inverse_softplus(y: float) -> float:
