@@ -109,7 +109,8 @@ of the stock `path` integrator with equal seeds on both sides; figures after ± 
 `gshell_path` uses `reparam_depth` = depth. "Right" means: bias within 1 % of the derivative or within two
 standard errors. "Corr." is the correlation of the gradient image with that of finite differences (both
 blurred by one pixel); "fwd - rev" the relative difference of forward and reverse mode with one seed. The last
-two columns show Mitsuba's projective integrators with default settings at 16 spp (in brackets their correlation).
+two columns show Mitsuba's projective integrators with default settings at 16 spp (in brackets their
+correlation).
 
 """
 

@@ -29,6 +29,7 @@ class GShellMaskIntegrator(ADIntegrator):
         super().__init__(props)
         self.warp_radius = props.get("warp_radius", 2.0)
         self.cull_hidden = props.get("cull_hidden", True)
+        self.said = set()   # warnings given so far
         self.crease_angle = props.get("crease_angle", 10.0)
 
     def aov_names(self):

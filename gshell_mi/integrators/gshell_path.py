@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
+from ..errors import UserError
 from . import reparameterised_film
 from .light_edges import BATCH, light_from_point, sample_directions, sample_points, shadow_points
 from .path_sample import PathSample
@@ -14,7 +15,35 @@ LIGHT_BATCHES = 2
 
 
 class GShellPathIntegrator(ADIntegrator):
-    """Path integrator with derivatives of visibility, by a warp of the film."""
+    """Path integrator whose derivatives include those of visibility.
+
+    Primary visibility moves by a warp of the film that follows the silhouettes
+    (:mod:`~gshell_mi.integrators.warp`); what the first surface receives, by the shadow boundaries on
+    the film (:mod:`~gshell_mi.integrators.light_edges`). Derivatives reach vertex positions, mesh
+    attributes, BSDFs, emitters and the sensor's ``to_world`` in one pass; alpha is differentiable.
+    Films keep any reconstruction filter, crop window and ``sample_border``. Sensors: ``perspective``;
+    another one raises :class:`~gshell_mi.errors.UserError` when differentiated.
+
+    Plugin parameters:
+
+    * ``max_depth`` (int, default 6), ``rr_depth`` (int, default 5), ``hide_emitters`` (bool, default
+      false): as for ``prb``.
+    * ``reparam_depth`` (int, default 2): how many segments of a path may lose sight of what they see:
+      1 the camera's, 2 also what the first surface receives, 3 also what the second one does.
+    * ``warp_radius`` (float, default 2 pixels): how far the warp reaches around a silhouette.
+    * ``light_edge_samples`` (float, default 1): samples of shadow boundaries per pixel of the film.
+    * ``crease_angle`` (float, default 10 degrees): edges of flat-shaded meshes above it count as
+      silhouettes do.
+    * ``cull_hidden`` (bool, default true): leave out silhouettes that other surfaces hide.
+
+    .. code-block:: xml
+
+        <integrator type="gshell_path"> <integer name="max_depth" value="3"/> </integrator>
+
+    .. code-block:: python
+
+        integrator = mi.load_dict({'type': 'gshell_path', 'max_depth': 3})
+    """
 
     def __init__(self, props):
         super().__init__(props)
@@ -22,6 +51,9 @@ class GShellPathIntegrator(ADIntegrator):
         self.warp_radius = props.get("warp_radius", 2.0)
         self.cull_hidden = props.get("cull_hidden", True)
         self.reparam_depth = props.get("reparam_depth", 2)
+        if self.reparam_depth not in (1, 2, 3):
+            raise UserError(f"gshell_path: reparam_depth is {self.reparam_depth}, but has to be 1, 2 or 3.")
+        self.said = set()   # warnings given so far
         self.crease_angle = props.get("crease_angle", 10.0)
         self.light_edge_samples = props.get("light_edge_samples", 1.0)
 
@@ -348,7 +380,8 @@ class GShellPathIntegrator(ADIntegrator):
 
     def to_string(self):
         return (f"GShellPathIntegrator[max_depth={self.max_depth}, rr_depth={self.rr_depth}, "
-                f"hide_emitters={self.hide_emitters}, warp_radius={self.warp_radius}]")
+                f"hide_emitters={self.hide_emitters}, "
+                f"reparam_depth={self.reparam_depth}, warp_radius={self.warp_radius}]")
 
 
 def _has_surface_emitters(scene):

@@ -173,7 +173,7 @@ def _sample_edges(mesh, table, sources, samples, sampler):
     # Systematic resampling: one uniform number for all samples
     cumulative = dr.cumsum(mi.Float64(importance))
     dr.eval(start, end, source, importance, cumulative)
-    mass = dr.gather(mi.Float64, cumulative, mi.UInt32(dr.width(cumulative) - 1))
+    mass = dr.gather(mi.Float64, cumulative, dr.opaque(mi.UInt32, dr.width(cumulative) - 1))
     offset = mi.Float64(sampler.next_1d()[0])
     scaled = dr.minimum(cumulative / mass, 1) * samples + dr.opaque(mi.Float64, offset[0])
     upper = mi.UInt32(dr.floor(scaled))

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import UserError
 from .edge_table import scene_edge_tables
 from .film_splat import FilmSplat
 from .silhouette_edges import screen_edges
+from .supported_scenes import check_sensor, warn_once
 from .warp import EdgeGrid, FilmWarp, fixed_line_weight
 
 
@@ -49,17 +49,6 @@ class CameraSamples:
         film = sensor.film()
         return sensor.sample_ray(self.time, self.wavelength, u / mi.Vector2f(film.crop_size()),
                                  mi.Point2f(0.5))
-
-
-def check_sensor(sensor):
-    """Raises for sensors whose silhouettes are not those of one viewpoint."""
-    if sensor.class_name() != "PerspectiveCamera":
-        raise UserError(f"Sensor '{sensor.id()}' is a {sensor.class_name()}: gshell_path and gshell_mask "
-                        "differentiate 'perspective' sensors only; use one of these, or mi.render() "
-                        "without derivatives.")
-    if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
-        raise UserError(f"The film of sensor '{sensor.id()}' has its own sample format, which gshell_path "
-                        "and gshell_mask cannot differentiate; use 'hdrfilm'.")
 
 
 def film_channels(film, value, alpha, aovs, wavelengths):
@@ -150,6 +139,7 @@ def _prepare(integrator, scene, sensor, seed, spp):
     if isinstance(sensor, int):
         sensor = scene.sensors()[sensor]
     check_sensor(sensor)
+    warn_once(scene, integrator.said)
     sampler, spp = integrator.prepare(sensor, seed, spp, integrator.aov_names())
     samples = CameraSamples.draw(sensor, sampler)
     dr.eval(samples.u, samples.time, samples.wavelength)

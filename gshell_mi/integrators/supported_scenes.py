@@ -1,0 +1,49 @@
+"""Says once which parts of a scene the integrators cannot differentiate correctly."""
+
+import warnings
+
+import mitsuba as mi
+
+from ..errors import UserError
+
+
+def check_sensor(sensor):
+    """Raises for sensors whose silhouettes are not those of one viewpoint, and for special films."""
+    if sensor.class_name() != "PerspectiveCamera":
+        raise UserError(f"Sensor '{sensor.id()}' is a {sensor.class_name()}: gshell_path and gshell_mask "
+                        "differentiate 'perspective' sensors only; use one of these, or mi.render() "
+                        "without derivatives.")
+    if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
+        raise UserError(f"The film of sensor '{sensor.id()}' has its own sample format, which gshell_path "
+                        "and gshell_mask cannot differentiate; use 'hdrfilm'.")
+
+
+def unsupported(scene):
+    """Sentences about what the derivatives of this scene leave out.
+
+    >>> scene = mi.load_dict({'type': 'scene', 'ball': {'type': 'sphere', 'id': 'ball'}})
+    >>> unsupported(scene)
+    ["Shape 'ball' is a Sphere: silhouettes are found for triangle meshes only."]
+    """
+    sentences = []
+    for shape in scene.shapes():
+        if not shape.is_mesh():
+            sentences.append(f"Shape '{shape.id()}' is a {shape.class_name()}: silhouettes are found for "
+                             "triangle meshes only.")
+        bsdf = shape.bsdf()
+        if bsdf is not None and any(mi.has_flag(bsdf.flags(), flag) for flag in
+                                    (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)):
+            sentences.append(f"Shape '{shape.id()}' is a perfect mirror or glass: silhouettes seen in or "
+                             "through it have no derivative.")
+        elif bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null):
+            sentences.append(f"Shape '{shape.id()}' is partly transparent: shadows seen through it have no "
+                             "derivative.")
+    return sentences
+
+
+def warn_once(scene, said):
+    """Warns of everything in :func:`unsupported` that is not in the set ``said``, and adds it there."""
+    for sentence in unsupported(scene):
+        if sentence not in said:
+            said.add(sentence)
+            warnings.warn(sentence, RuntimeWarning, stacklevel=2)

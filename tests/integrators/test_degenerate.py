@@ -1,0 +1,96 @@
+"""Degenerate meshes and viewpoints, changing sizes, and long runs."""
+
+import resource
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from pipelines import gradient_scenes as scenes
+
+
+def gradient(scene, integrator, spp=4, seed=0):
+    """Gradient of a weighted image with respect to the subject's vertices."""
+    params = mi.traverse(scene)
+    key = "subject.vertex_positions"
+    params[key] = mi.Float(params[key])
+    dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(scene, params, integrator=integrator, spp=spp, seed=seed)
+    weights = np.broadcast_to(np.linspace(0, 1, image.shape[1])[None, :, None], image.shape)
+    dr.backward(dr.sum(image * mi.TensorXf(weights.astype(np.float32))))
+    return np.array(image), np.array(dr.grad(params[key]))
+
+
+MESHES = {
+    "degenerate faces": (scenes.sphere(1)[0], np.concatenate([scenes.sphere(1)[1], [[0, 0, 0], [3, 3, 5]]])),
+    "zero-area face": ([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]], [[0, 1, 2], [0, 1, 3]]),
+    "only degenerate faces": ([[0, 0, 0]] * 3, [[0, 0, 0], [1, 1, 1]]),
+    "behind the camera": scenes.sphere(1, 1, (0, 0, 9)),
+    "around the camera": scenes.sphere(1, 2, (0, 0, 5)),
+    "through the camera": scenes.sheet(2),
+}
+
+
+@pytest.mark.parametrize("kind", ["gshell_path", "gshell_mask"])
+@pytest.mark.parametrize("name", MESHES)
+def test_finite(name, kind):
+    v, f = MESHES[name]
+    v = np.array(v, float) + (np.array([0, 0.01, 5]) if name == "through the camera" else 0)
+    scene = scenes.load(scenes.camera(16), scenes.constant(), scenes.make_mesh("subject", v, f))
+    image, grad = gradient(scene, mi.load_dict({"type": kind, "max_depth": 3}))
+    assert np.isfinite(image).all() and np.isfinite(grad).all()
+
+
+def test_behind_the_camera_has_no_gradient_of_coverage():
+    v, f = scenes.sphere(1, 1, (0, 0, 9))
+    scene = scenes.load(scenes.camera(16), scenes.constant(), scenes.make_mesh("subject", v, f))
+    assert np.all(gradient(scene, mi.load_dict({"type": "gshell_mask"}))[1] == 0)
+
+
+def compiled(run):
+    """Number of kernels compiled (not found in a cache) while ``run`` runs."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        run()
+        history = dr.kernel_history([dr.KernelType.JIT])
+    return sum(not entry["cache_hit"] for entry in history), len(history)
+
+
+def test_no_recompilation_when_sizes_change():
+    """A mesh of another connectivity in every iteration, its buffers padded to the same sizes."""
+    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 3, "hide_emitters": True})
+    scene = scenes.load(scenes.camera(24), scenes.constant(),
+                        scenes.make_mesh("subject", np.zeros((600, 3)), np.zeros((1200, 3), int)))
+    params = mi.traverse(scene)
+
+    def iterate(n, seed):
+        v, f = scenes.sheet(n)
+        vertices, faces = np.repeat(v[:1], 600, 0), np.zeros((1200, 3), int)
+        vertices[:len(v)], faces[:len(f)] = v, f
+        params["subject.vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
+        params["subject.faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+        dr.enable_grad(params["subject.vertex_positions"])
+        params.update()
+        dr.backward(dr.sum(mi.render(scene, params, integrator=integrator, spp=4, seed=seed)))
+        assert np.isfinite(np.array(dr.grad(params["subject.vertex_positions"]))).all()
+
+    for n in (5, 6, 7):
+        iterate(n, n)
+    recompiled, launched = compiled(lambda: [iterate(n, 100 + n) for n in (8, 11, 13, 17, 19)])
+    assert launched > 20
+    assert recompiled == 0
+
+
+@pytest.mark.slow
+def test_memory_stays_flat():
+    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 3, "hide_emitters": True})
+    v, f = scenes.sphere(2)
+    scene = scenes.load(scenes.camera(16), scenes.constant(), scenes.make_mesh("subject", v, f))
+    for seed in range(50):
+        gradient(scene, integrator, seed=seed)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for seed in range(450):
+        gradient(scene, integrator, seed=seed)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 30_000    # KiB

@@ -1,0 +1,176 @@
+"""Derivatives of gshell_path and gshell_mask against finite differences and against each other."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from gshell_mi.errors import UserError
+from pipelines import gradient_scenes as scenes
+
+RESOLUTION = 24
+CASES = {case.name: case for case in scenes.SCENES}
+QUICK = ["sphere_translating", "sheet_scaling", "cube_flat_shaded", "leaving_the_frame", "shadow_point_light"]
+
+
+def path(case, **options):
+    return mi.load_dict({"type": "gshell_path", "max_depth": case.depth, "reparam_depth": case.depth,
+                         "hide_emitters": case.hide_emitters, **options})
+
+
+def weighted(images):
+    weights = scenes.image_weights(RESOLUTION)
+    return np.array([(image[..., :3] * weights).sum() for image in images])
+
+
+def mean_and_error(x):
+    return x.mean(), x.std(ddof=1) / np.sqrt(len(x))
+
+
+@pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
+                                  for name in CASES])
+def test_against_finite_differences(name):
+    case = CASES[name]
+    mover = scenes.Mover(case, RESOLUTION)
+    fd, fd_error = mean_and_error(weighted(scenes.finite_differences(mover, case, 512, 6)))
+    ours = [scenes.forward_image(mover, path(case), 64, seed) for seed in range(8)]
+    mean, error = mean_and_error(weighted(ours))
+    assert abs(mean - fd) <= max(0.01 * abs(fd), 3.5 * np.hypot(fd_error, error))
+
+
+@pytest.mark.parametrize("name", ["shirt_translating", "open_box", "border_sampled"])
+def test_reverse_equals_forward(name):
+    case = CASES[name]
+    mover = scenes.Mover(case, RESOLUTION)
+    integrator = path(case)
+    forward = weighted([scenes.forward_image(mover, integrator, 8, 3)])[0]
+    reverse = scenes.reverse_derivative(mover, integrator, 8, 3, scenes.image_weights(RESOLUTION))
+    assert reverse == pytest.approx(forward, rel=1e-3)
+
+
+def test_replayed_vertices_reverse_equals_forward():
+    """Depth 5 in an open box: replayed vertices and the adjoint of the one before them."""
+    case = CASES["open_box"]
+    mover = scenes.Mover(case, RESOLUTION)
+    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 5, "hide_emitters": True})
+    forward = weighted([scenes.forward_image(mover, integrator, 8, 3)])[0]
+    reverse = scenes.reverse_derivative(mover, integrator, 8, 3, scenes.image_weights(RESOLUTION))
+    assert reverse == pytest.approx(forward, rel=1e-3)
+
+
+def test_few_samples_are_unbiased():
+    case = CASES["sphere_translating"]
+    mover = scenes.Mover(case, RESOLUTION)
+    integrator = path(case)
+    few = weighted([scenes.forward_image(mover, integrator, 2, seed) for seed in range(64)])
+    many = weighted([scenes.forward_image(mover, integrator, 256, seed) for seed in range(8)])
+    (few, few_error), (many, error) = mean_and_error(few), mean_and_error(many)
+    assert few_error < 0.05 * abs(many)
+    assert abs(few - many) <= 3.5 * np.hypot(few_error, error)
+
+
+def test_alpha_of_a_scaled_sphere():
+    """The coverage of a sphere is the area of its projection: a closed form."""
+    case = CASES["sphere_scaling"]
+    mover = scenes.Mover(case, 32)
+    image = np.mean([scenes.forward_image(mover, path(case), 64, s) for s in range(4)], 0)
+    tan2 = 1 / (5.0**2 - 1)     # square of the tangent of the cone around a unit sphere
+    derivative = 2 * 5**2 / (5**2 - 1) ** 2     # of that tangent's square, over the radius
+    pixels = (16 / np.tan(np.deg2rad(20))) ** 2
+    assert np.pi * tan2 * pixels == pytest.approx(np.array(mi.render(
+        mover.scene, integrator=path(case), spp=64))[..., 3].sum(), rel=0.02)
+    assert image[..., 3].sum() == pytest.approx(np.pi * derivative * pixels, rel=0.02)
+
+
+def test_mask_integrator_matches_path_coverage_and_its_own_reverse_mode():
+    case = CASES["sheet_translating"]
+    mover = scenes.Mover(case, RESOLUTION)
+    mask = mi.load_dict({"type": "gshell_mask"})
+    image = scenes.forward_image(mover, mask, 64, 1)
+    assert image.shape[-1] == 8
+    alpha = scenes.forward_image(mover, path(case), 64, 1)[..., 3]
+    np.testing.assert_allclose(image[..., 3], alpha, rtol=1e-4, atol=1e-3)
+    ramp = np.linspace(0, 1, RESOLUTION, dtype=np.float32)
+    x = np.broadcast_to(ramp[None, :, None], image.shape)
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    mover.to(t)
+    rendered = mi.render(mover.scene, mover.params, integrator=mask, spp=64, seed=1)
+    dr.backward(dr.sum(rendered * mi.TensorXf(np.array(x))))
+    assert dr.grad(t)[0] == pytest.approx((image * x).sum(), rel=1e-3)
+
+
+def test_material_and_light_receive_derivatives():
+    """The image is linear in albedo (at depth 2) and in the light, so the derivatives are known."""
+    v, f = scenes.sphere(2)
+    scene = scenes.load(scenes.camera(RESOLUTION), scenes.constant(0.5), scenes.make_mesh("subject", v, f))
+    params = mi.traverse(scene)
+    albedo = next(k for k in params.keys() if k.endswith("reflectance.value"))
+    light = next(k for k in params.keys() if k.endswith("radiance.value"))
+    for key in (albedo, light):
+        dr.enable_grad(params[key])
+    params.update()
+    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 2, "hide_emitters": True})
+    image = mi.render(scene, params, integrator=integrator, spp=256)
+    total = dr.sum(image[:, :, :3])
+    dr.backward(total)
+    # The red, green and blue of the albedo times their derivatives make up the whole image.
+    by_albedo = dr.sum(params[albedo] * dr.grad(params[albedo]))
+    by_light = dr.sum(params[light] * dr.grad(params[light]))
+    assert by_albedo[0] == pytest.approx(total.array[0], rel=0.01)
+    assert by_light[0] == pytest.approx(total.array[0], rel=0.01)
+
+
+def test_camera_motion_is_the_opposite_of_object_motion():
+    v, f = scenes.sphere(3)
+    scene = scenes.load(scenes.camera(RESOLUTION), scenes.constant(), scenes.make_mesh("subject", v, f))
+    params = mi.traverse(scene)
+    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 2, "hide_emitters": True})
+    weights = mi.TensorXf(scenes.image_weights(RESOLUTION))
+    rest, pose = mi.Float(params["subject.vertex_positions"]), mi.Transform4f(params["sensor.to_world"])
+    derivatives = []
+    for moves_camera in (False, True):
+        t = mi.Float(0)
+        dr.enable_grad(t)
+        shift = mi.Vector3f(1, 0.5, 0.3) * t
+        if moves_camera:
+            params["subject.vertex_positions"] = rest
+            params["sensor.to_world"] = mi.Transform4f().translate(shift) @ pose
+        else:
+            params["subject.vertex_positions"] = dr.ravel(dr.unravel(mi.Point3f, rest) + shift)
+        params.update()
+        image = mi.render(scene, params, integrator=integrator, spp=64, seed=2)
+        dr.backward(dr.sum(image[:, :, :3] * weights))
+        derivatives.append(dr.grad(t)[0])
+    assert derivatives[1] == pytest.approx(-derivatives[0], rel=0.02)
+
+
+def test_other_sensors_are_refused():
+    sensor = {**scenes.camera(8), "type": "thinlens", "aperture_radius": 0.1}
+    v, f = scenes.sphere(1)
+    scene = scenes.load(sensor, scenes.constant(), scenes.make_mesh("subject", v, f))
+    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 2})
+    assert np.isfinite(np.array(mi.render(scene, integrator=integrator, spp=4))).all()
+    with pytest.raises(UserError, match=r"ThinLensCamera.*'perspective' sensors only"):
+        integrator.render_forward(scene, None, 0)
+
+
+def test_reparam_depth_is_checked():
+    with pytest.raises(Exception, match="reparam_depth is 7"):
+        mi.load_dict({"type": "gshell_path", "reparam_depth": 7})
+
+
+def test_warns_once_of_what_it_cannot_differentiate():
+    v, f = scenes.sphere(1)
+    glass = {"type": "sphere", "id": "ball", "center": [1, 0, 0], "radius": 0.3,
+             "bsdf": {"type": "dielectric"}}
+    scene = scenes.load(scenes.camera(8), scenes.constant(), scenes.make_mesh("subject", v, f), ball=glass)
+    params = mi.traverse(scene)
+    dr.enable_grad(params["subject.vertex_positions"])
+    params.update()
+    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 3})
+    with pytest.warns(RuntimeWarning) as caught:
+        for seed in range(2):
+            dr.backward(dr.sum(mi.render(scene, params, integrator=integrator, spp=4, seed=seed)))
+    messages = sorted(str(w.message) for w in caught if "ball" in str(w.message))
+    assert len(messages) == 2 and "Sphere" in messages[0] and "mirror or glass" in messages[1]

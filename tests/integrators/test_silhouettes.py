@@ -1,0 +1,104 @@
+"""Edges and silhouettes of meshes: adjacency, projection, culling."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from gshell_mi.integrators.edge_table import build_edge_table, scene_edge_tables
+from gshell_mi.integrators.silhouette_edges import crease_mask, screen_edges, silhouette_mask
+from pipelines import gradient_scenes as scenes
+
+
+def arrays(vertices, faces):
+    return mi.Float(np.ravel(vertices).astype(np.float32)), mi.UInt32(np.ravel(faces).astype(np.uint32))
+
+
+def open_edges(vertices, faces):
+    table = build_edge_table(*arrays(vertices, faces))
+    return dr.count(table.degree == 1), dr.count(table.degree == 2)
+
+
+def test_edge_counts_follow_euler():
+    v, f = scenes.sphere(2)
+    assert open_edges(v, f) == (0, len(f) * 3 // 2)
+
+
+def test_boundary_of_open_cylinder():
+    v, f = scenes.open_cylinder(n=20, rings=3)
+    assert open_edges(v, f)[0] == 40
+
+
+def test_texture_seam_is_no_boundary():
+    v, f, _ = scenes.uv_sphere(n=6)
+    assert open_edges(v, f)[0] == 0
+
+
+def test_padding_is_ignored():
+    v, f = scenes.sheet(3)
+    padded = np.concatenate([f, np.zeros((7, 3), int), np.full((2, 3), 5)])
+    v = np.concatenate([v, np.repeat(v[:1], 9, 0)])
+    assert open_edges(v, padded) == open_edges(v, f)
+
+
+def test_silhouette_does_not_depend_on_orientation():
+    v, f = scenes.sphere(2)
+    flipped = f.copy()
+    flipped[::3] = flipped[::3, ::-1]
+    counts = []
+    for faces in (f, flipped):
+        positions, indices = arrays(v, faces)
+        table = build_edge_table(positions, indices)
+        counts.append(dr.count(silhouette_mask(positions, indices, table, mi.Point3f(0.3, 0.2, 6))))
+    assert counts[0] == counts[1] > 8
+
+
+def test_silhouette_of_a_sphere_closes():
+    """Each vertex of the silhouette of a closed mesh has an even number of silhouette edges."""
+    v, f = scenes.sphere(3)
+    positions, indices = arrays(v, f)
+    table = build_edge_table(positions, indices)
+    chosen = np.array(silhouette_mask(positions, indices, table, mi.Point3f(0.3, 0.2, 6)))
+    ends = np.concatenate([np.array(table.start)[chosen], np.array(table.end)[chosen]])
+    assert np.all(np.bincount(ends) % 2 == 0)
+
+
+def test_creases_of_a_flat_cube():
+    scene, _ = scenes._cube(8)
+    (mesh, table), = scene_edge_tables(scene)
+    assert dr.count(crease_mask(mesh, table, 10)) == 12
+    assert dr.count(crease_mask(mesh, table, 95)) == 0
+
+
+def projected_length(scene, **options):
+    tables = scene_edge_tables(scene)
+    with dr.suspend_grad():
+        edges = screen_edges(scene, tables, scene.sensors()[0], 4.0, **options)
+    return 0.0 if edges is None else float(dr.sum(dr.norm(edges.b - edges.a))[0])
+
+
+def test_length_of_a_projected_circle():
+    v, f = scenes.sphere(4)
+    scene = scenes.load(scenes.camera(64), scenes.constant(), scenes.make_mesh("subject", v, f))
+    tangent = 1 / np.sqrt(5**2 - 1)     # of half the angle under which the sphere is seen
+    circumference = 2 * np.pi * tangent * 32 / np.tan(np.deg2rad(20))
+    # The silhouette of a polyhedron is a zigzag near that circle.
+    assert projected_length(scene) == pytest.approx(circumference, rel=0.1)
+
+
+def test_hidden_silhouettes_are_culled():
+    v, f = scenes.sphere(3, 0.5)
+    w, g = scenes.sheet(2, 3.0)
+    scene = scenes.load(scenes.camera(64), scenes.constant(), scenes.make_mesh("subject", v, f),
+                        curtain=scenes.make_mesh("curtain", w + np.array([0, 0, 1.5]), g))
+    alone = scenes.load(scenes.camera(64), scenes.constant(),
+                        scenes.make_mesh("curtain", w + np.array([0, 0, 1.5]), g))
+    assert projected_length(scene) == pytest.approx(projected_length(alone), rel=1e-5)
+    assert projected_length(scene, cull=False) > projected_length(alone) + 20
+
+
+@pytest.mark.parametrize("centre", [(0, 0, 9), (0, 0, 5), (100, 0, 0)])
+def test_behind_around_and_beside_the_camera(centre):
+    v, f = scenes.sphere(2, 1, centre)
+    scene = scenes.load(scenes.camera(32), scenes.constant(), scenes.make_mesh("subject", v, f))
+    assert projected_length(scene) == 0
