@@ -12,6 +12,9 @@ import mitsuba as mi
 
 _EMPTY = 0xFFFFFFFF
 
+#: How to add to arrays whose size changes: the automatic choice may bake the size into the kernel.
+SIZE_INDEPENDENT = dr.ReduceMode.Local
+
 
 @dr.syntax
 def first_with_equal_key(keys, active):
@@ -63,7 +66,8 @@ def first_with_equal_key(keys, active):
     dr.eval(result)     # what an atomic returned cannot be computed a second time
     lowest = dr.full(mi.UInt32, _EMPTY, n)
     taking_part = result != _EMPTY
-    dr.scatter_reduce(dr.ReduceOp.Min, lowest, index, result, taking_part)
+    dr.scatter_reduce(dr.ReduceOp.Min, lowest, index, result, taking_part,
+                      mode=SIZE_INDEPENDENT)
     return dr.select(taking_part, dr.gather(mi.UInt32, lowest, result, taking_part), _EMPTY)
 
 
@@ -125,9 +129,9 @@ def build_edge_table(positions, faces) -> EdgeTable:
     edge = first_with_equal_key([dr.minimum(a, b), dr.maximum(a, b)], valid)
 
     degree = dr.zeros(mi.Int32, corner_count)
-    dr.scatter_add(degree, mi.Int32(1), edge, valid)
+    dr.scatter_add(degree, mi.Int32(1), edge, valid, mode=SIZE_INDEPENDENT)
     copies = dr.zeros(mi.UInt32, corner_count)
-    dr.scatter_add(copies, start + end, edge, valid)
+    dr.scatter_add(copies, start + end, edge, valid, mode=SIZE_INDEPENDENT)
     split = copies != (start + end) * mi.UInt32(degree)
     dr.eval(start, end, edge, forward, valid, split, degree)
     return EdgeTable(start, end, edge, forward, valid, split, degree)

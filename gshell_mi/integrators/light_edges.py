@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .edge_table import SIZE_INDEPENDENT
 from .silhouette_edges import project_to_film
 
 BATCH = 32
@@ -122,8 +123,10 @@ def _silhouette_bits(mesh, table, sources):
     side = dr.select(table.forward, side, ~side)
     everywhere = dr.full(mi.UInt32, 0xFFFFFFFF, 3 * n)
     above, below = everywhere, dr.full(mi.UInt32, 0xFFFFFFFF, 3 * n)
-    dr.scatter_reduce(dr.ReduceOp.And, above, side, table.edge, table.valid)
-    dr.scatter_reduce(dr.ReduceOp.And, below, ~side, table.edge, table.valid)
+    dr.scatter_reduce(dr.ReduceOp.And, above, side, table.edge, table.valid,
+                      mode=SIZE_INDEPENDENT)
+    dr.scatter_reduce(dr.ReduceOp.And, below, ~side, table.edge, table.valid,
+                      mode=SIZE_INDEPENDENT)
     return dr.select(table.degree > 0, above | below, 0)
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .edge_table import SIZE_INDEPENDENT
+
 
 @dataclass
 class ScreenEdges:
@@ -47,7 +49,7 @@ def silhouette_mask(positions, faces, table, viewpoint):
     towards = dr.dot(corners[0], dr.cross(corners[1], corners[2])) < 0
     side = dr.select(towards == table.forward, mi.Int32(1), mi.Int32(-1))
     sides = dr.zeros(mi.Int32, n)
-    dr.scatter_add(sides, side, table.edge, table.valid)
+    dr.scatter_add(sides, side, table.edge, table.valid, mode=SIZE_INDEPENDENT)
     dr.eval(sides)
     return (table.degree > 0) & (dr.abs(sides) == table.degree)
 
@@ -68,7 +70,7 @@ def crease_mask(mesh, table, angle):
     normal = dr.select(table.forward, normal, -normal)    # differ in sign where orientation agrees
     total = dr.zeros(mi.Vector3f, n)
     for k in range(3):
-        dr.scatter_add(total[k], normal[k], table.edge, table.valid)
+        dr.scatter_add(total[k], normal[k], table.edge, table.valid, mode=SIZE_INDEPENDENT)
     sharp = (table.degree == 2) & (dr.squared_norm(total) > 2 - 2 * dr.cos(dr.deg2rad(angle)))
     if flat:
         return sharp

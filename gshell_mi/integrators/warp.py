@@ -14,6 +14,8 @@ form, so no auxiliary rays are needed.
 import drjit as dr
 import mitsuba as mi
 
+from .edge_table import SIZE_INDEPENDENT
+
 
 class EdgeGrid:
     """For each pixel of a rectangle the edge pieces within ``radius`` of it.
@@ -166,7 +168,7 @@ class FilmWarp(dr.CustomOp):
             on_a, on_b = (1 - t) * on_point - stretch, t * on_point + stretch
             near = w > 0
             for j, x in enumerate((on_a.x, on_a.y, on_b.x, on_b.y)):
-                dr.scatter_add(adjoint, x, 4 * piece + j, near)
+                dr.scatter_add(adjoint, x, 4 * piece + j, near, mode=SIZE_INDEPENDENT)
             k += 1
         index = 4 * dr.arange(mi.UInt32, self.count)
         ax, ay, bx, by = (dr.gather(mi.Float, adjoint, index + j) for j in range(4))

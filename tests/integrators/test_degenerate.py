@@ -50,12 +50,13 @@ def test_behind_the_camera_has_no_gradient_of_coverage():
 
 
 def compiled(run):
-    """Number of kernels compiled (not found in a cache) while ``run`` runs."""
+    """Numbers of kernels compiled and of kernels launched while ``run`` runs."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         run()
         history = dr.kernel_history([dr.KernelType.JIT])
-    return sum(not entry["cache_hit"] for entry in history), len(history)
+    # A kernel that an earlier process left on disk is new to this one all the same.
+    return sum(not e["cache_hit"] or e["cache_disk"] for e in history), len(history)
 
 
 def test_no_recompilation_when_sizes_change():
