@@ -1,9 +1,32 @@
-"""G-Shell inverse rendering in Mitsuba 3: photographs in; open meshes, materials and light out."""
+"""G-Shell inverse rendering in Mitsuba 3: photographs in; open meshes, materials and light out.
+
+The rooms, in the order in which data flows through them:
+
+- ``lattice``, ``fields``, ``extraction``: from signed distances on a lattice to a triangle mesh
+- ``shape``: the same as a Mitsuba shape, ``{"type": "gshell"}``
+- ``integrators``: rendering with right derivatives, ``{"type": "gshell_path"}`` and ``gshell_mask``
+- ``targets``, ``views``, ``scene``: what a fit starts from
+- ``losses``, ``material``, ``light``, ``fit``: the optimisation, ``python -m gshell_mi.fit``
+- ``images``, ``topology``, ``export``: what it leaves behind
+- ``doctor``: whether this machine can run it all
+
+Importing the package sets no variant; its plugins register for the variant in use and for every later one.
+
+>>> import drjit as dr, mitsuba as mi
+>>> lattice = TetLattice(32)
+>>> points = lattice.points(mi.Float)
+>>> bowl = extract(lattice, sdf=dr.norm(points) - 0.7, msdf=0.2 - points.z)
+>>> float(dr.max(bowl.vertices.z)[0]) < 0.2 + 1e-5     # cut open at z = 0.2
+True
+"""
 
 from .errors import UserError
+from .extraction import SurfaceMesh, extract
+from .fields import LatticeFields
+from .lattice import TetLattice
 from .plugins import register_on_variant_change
 
 __version__ = "0.1.0"
-__all__ = ["UserError", "__version__"]
+__all__ = ["LatticeFields", "SurfaceMesh", "TetLattice", "UserError", "__version__", "extract"]
 
 register_on_variant_change()
