@@ -7,8 +7,10 @@ of the image with expected weights,
     I_p = 1/E_p sum_i h(T(u_i) - p) L_i det_i,   E_p = spp * integral of h over the sampled domain,
 
 whose noise is brought back down by a control variate: det(T) h(T(u) - p) integrates to a constant,
-so any value that does not depend on sample i can be subtracted from L_i in the terms that involve
-T. The mean of the *other* samples on the pixel is a value that does not.
+so a value that is independent of the samples can be subtracted from every L_i in the terms that
+involve T. The samples of each pixel are split in halves, and the mean over one half is subtracted in
+the other. (Leaving out sample i alone is biased: samples are stratified over pixels, so what is left
+would depend on the pixel of i.)
 """
 
 import drjit as dr
@@ -27,11 +29,12 @@ class FilmSplat:
     u:
         ``Point2f``: sample positions in pixels relative to the crop window.
     values:
-        List of ``Float``: the channels of each sample, which ``adjoint`` and ``tangent`` need.
+        List of ``Float``: the channels of each sample, which ``adjoint`` and ``tangent`` need. They
+        also take the samples to be in the order of their pixels.
     """
 
     def __init__(self, film, spp, u, values=()):
-        self.u, self.values = dr.detach(u), [dr.detach(v) for v in values]
+        self.spp, self.u, self.values = spp, dr.detach(u), [dr.detach(v) for v in values]
         self.width, self.height = film.crop_size()
         self.rfilter = film.rfilter()
         self.box = self.rfilter.is_box_filter()
@@ -93,16 +96,24 @@ class FilmSplat:
                 yield mi.UInt32(y * self.width + x), inside, hx * hy, mi.Vector2f(sx * hy, hx * sy), scale
 
     def _sums(self):
-        """Per pixel: the sum of filter weights, and of weighted values per channel."""
+        """Per half of the samples and pixel: the sum of filter weights, and of weighted values."""
         n = self.width * self.height
-        weight = dr.zeros(mi.Float, n)
-        sums = [dr.zeros(mi.Float, n) for _ in self.values]
+        weight = dr.zeros(mi.Float, 2 * n)
+        sums = [dr.zeros(mi.Float, 2 * n) for _ in self.values]
+        first, _ = self._halves()
         for pixel, inside, h, _, _ in self._taps():
-            dr.scatter_add(weight, h, pixel, inside)
+            dr.scatter_add(weight, h, first + pixel, inside)
             for s, v in zip(sums, self.values, strict=True):
-                dr.scatter_add(s, h * v, pixel, inside)
+                dr.scatter_add(s, h * v, first + pixel, inside)
         dr.eval(weight, sums)
         return weight, sums
+
+    def _halves(self):
+        """Where the sums of a sample's own half and of the other one begin."""
+        n = dr.opaque(mi.UInt32, self.width * self.height)
+        index = dr.arange(mi.UInt32, dr.width(self.u))
+        half = (index - index // dr.opaque(mi.UInt32, self.spp) * dr.opaque(mi.UInt32, self.spp)) & 1
+        return half * n, (1 - half) * n
 
     def gather(self, image):
         """Per sample and channel the filtered image value: the adjoint of splatting values."""
@@ -128,9 +139,11 @@ class FilmSplat:
         """
         weight, sums = self._sums()
         product = dr.zeros(mi.Float, dr.width(weight))
+        pixel = dr.arange(mi.UInt32, dr.width(weight)) % dr.opaque(mi.UInt32, self.width * self.height)
         for g, s in zip(image_adjoint, sums, strict=True):
-            product += g * s
+            product += dr.gather(mi.Float, g, pixel) * s
         dr.eval(product)
+        _, other = self._halves()
         on_values = [mi.Float(0) for _ in self.values]
         on_shift, on_det = mi.Vector2f(0), mi.Float(0)
         for pixel, inside, h, slope, scale in self._taps():
@@ -139,8 +152,8 @@ class FilmSplat:
                 gc = dr.gather(mi.Float, g, pixel, inside)
                 on_values[c] += h * scale * gc
                 own += gc * v
-            rest = dr.gather(mi.Float, weight, pixel, inside) - h
-            others = (dr.gather(mi.Float, product, pixel, inside) - h * own) / rest
+            rest = dr.gather(mi.Float, weight, other + pixel, inside)
+            others = dr.gather(mi.Float, product, other + pixel, inside) / rest
             contrast = (own - dr.select(dr.abs(rest) > 1e-2, others, 0)) * scale
             on_shift += slope * contrast
             on_det += h * contrast
@@ -149,12 +162,13 @@ class FilmSplat:
     def tangent(self, value_tangents, shift, divergence):
         """The image tangent for tangents of the values, of T(u) - u and of det."""
         weight, sums = self._sums()
+        _, other = self._halves()
         result = [dr.zeros(mi.Float, self.width * self.height) for _ in self.values]
         for pixel, inside, h, slope, scale in self._taps():
             moved = dr.dot(slope, shift) + h * divergence
-            rest = dr.gather(mi.Float, weight, pixel, inside) - h
+            rest = dr.gather(mi.Float, weight, other + pixel, inside)
             for r, s, v, dv in zip(result, sums, self.values, value_tangents, strict=True):
-                others = (dr.gather(mi.Float, s, pixel, inside) - h * v) / rest
+                others = dr.gather(mi.Float, s, other + pixel, inside) / rest
                 others = dr.select(dr.abs(rest) > 1e-2, others, 0)
                 dr.scatter_add(r, scale * (h * dv + moved * (v - others)), pixel, inside)
         dr.eval(result)
