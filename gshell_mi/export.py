@@ -141,7 +141,8 @@ def export_fit(output: Path, fit: FitScene, joint: JointStage, config: FitConfig
     return metrics
 
 
-def _write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray, attributes: dict[str, np.ndarray]) -> None:
+def _write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray,
+                attributes: dict[str, np.ndarray]) -> None:
     """A PLY with smooth normals in Mitsuba's naming: ``vertex_color`` is stored as ``color_0`` and so on."""
     columns = {"x": vertices[:, 0], "y": vertices[:, 1], "z": vertices[:, 2]}
     normals = _vertex_normals(vertices, faces)

@@ -15,7 +15,8 @@ def srgb(linear: np.ndarray) -> np.ndarray:
     0.7354
     """
     linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
+    curve = 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, curve)
 
 
 def over_white(rgba: np.ndarray) -> np.ndarray:

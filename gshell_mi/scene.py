@@ -1,4 +1,4 @@
-"""The fit scene: an ordinary Mitsuba XML file with one gshell shape, the training sensors and their targets."""
+"""The fit scene: a Mitsuba XML file with one gshell shape, the training sensors and their targets."""
 
 from __future__ import annotations
 
@@ -67,7 +67,8 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
         raise UserError(f"Scene '{path}' has no sensors; add a <sensor id=\"view_000\"> per training view.")
     repeated = [name for name, count in Counter(sensor.id() for sensor in sensors).items() if count > 1]
     if repeated:
-        raise UserError(f"Scene '{path}' has several sensors with the id '{repeated[0]}'; rename all but one.")
+        raise UserError(f"Scene '{path}' has several sensors with the id '{repeated[0]}'; "
+                        f"rename all but one.")
     folder = Path(targets) if targets else path.with_suffix("")
     if targets is None:
         _render_missing_targets(path, folder, sensors, on_reference)

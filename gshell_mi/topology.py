@@ -51,8 +51,15 @@ def topology(vertices: np.ndarray, faces: np.ndarray) -> Topology:
     diagonal = np.linalg.norm(np.ptp(vertices[used], axis=0))
     pinholes = int((loops <= PINHOLE * diagonal).sum())
     component = vertex_components(edges, len(vertices))[1]
-    return Topology(len(vertices), len(faces), len(np.unique(component[used])), len(loops) - pinholes, pinholes,
-                    round(float(lengths.sum()), 6), int((uses > 2).sum()))
+    return Topology(
+        vertices=len(vertices),
+        faces=len(faces),
+        components=len(np.unique(component[used])),
+        boundary_loops=len(loops) - pinholes,
+        pinholes=pinholes,
+        boundary_length=round(float(lengths.sum()), 6),
+        nonmanifold_edges=int((uses > 2).sum()),
+    )
 
 
 def vertex_components(edges: np.ndarray, vertex_count: int) -> tuple[int, np.ndarray]:

@@ -94,5 +94,6 @@ def restore_optimizer(name: str, optimizer: mi.ad.Adam, arrays: Mapping[str, np.
         stored = {part: arrays[f"{name}/{key}/{part}"] for part in ("value", "step", "first", "second")}
         restored = type(value)(stored["value"])
         dr.enable_grad(restored)
-        optimizer.state[key] = (restored, promoted, rate, (
-            type(step)(stored["step"]), type(first)(stored["first"]), type(second)(stored["second"]), maximum))
+        step, first, second = (type(old)(stored[part])
+                               for old, part in ((step, "step"), (first, "first"), (second, "second")))
+        optimizer.state[key] = (restored, promoted, rate, (step, first, second, maximum))

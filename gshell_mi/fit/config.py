@@ -26,7 +26,8 @@ class FitConfig:
 
     # --- visual hull
     hull_daylight_votes: float = 0.15
-    """Fraction of the views that must see daylight at a point before an enclosed hole of the masks is carved."""
+    """Fraction of the views that must see daylight at a point before an enclosed hole of the masks is
+    carved."""
 
     # --- radiance ghost: finds the openings
     ghost_iterations: int = 400

@@ -102,7 +102,7 @@ class JointStage:
         config, surface = self.config, self.subject.surface
         faces = mi.Vector3u(surface.faces)
         total = mi.Float(0)
-        for name, field in self.material.values().items():
+        for field in self.material.values().values():
             channels = dr.width(field) // self.subject.lattice.vertex_count
             values = surface.interpolate(field, channels)
             total += config.material_smoothness * losses.edge_smoothness(values, faces)

@@ -87,7 +87,8 @@ def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: TetLa
     return dr.select(known, msdf, 1) * lattice.spacing
 
 
-def splat_to_lattice(values: mi.Float, template: SurfaceMesh, lattice: TetLattice) -> tuple[mi.Float, mi.Bool]:
+def splat_to_lattice(values: mi.Float, template: SurfaceMesh,
+                     lattice: TetLattice) -> tuple[mi.Float, mi.Bool]:
     """Turns values at the template's vertices, one or three channels, into a lattice field.
 
     Each lattice vertex takes the mean of the template vertices on its edges, weighted as they

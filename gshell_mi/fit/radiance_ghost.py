@@ -12,9 +12,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.csgraph
 from cholespy import CholeskySolverF, MatrixType
+from scipy.sparse import coo_matrix, eye
+from scipy.sparse.csgraph import laplacian
 
 from .. import losses
 from ..views import PinholeViews
@@ -132,11 +132,14 @@ class RadianceGhost:
 
     def _update(self, names: tuple[str, ...], rate: float) -> None:
         """Steps the parameters ``names`` along their Sobolev gradients; the others rest."""
-        for name in ("opacity", *SIDES):
+        rates = {name: rate if name in names else 0.0 for name in ("opacity", *SIDES)}
+        for name in rates:
             parameter = self.optimizer[name]
-            gradient = dr.grad(parameter)
-            dr.set_grad(parameter, self._smooth(gradient) if name in names else dr.zeros(mi.Float, dr.width(gradient)))
-        self.optimizer.set_learning_rate({name: rate if name in names else 0.0 for name in ("opacity", *SIDES)})
+            gradient = dr.zeros(mi.Float, dr.width(parameter))
+            if name in names:
+                gradient = self._smooth(dr.grad(parameter))
+            dr.set_grad(parameter, gradient)
+        self.optimizer.set_learning_rate(rates)
         self.optimizer.step()
 
     def smoothed_logits(self) -> np.ndarray:
@@ -206,8 +209,8 @@ def _sobolev_solver(faces: np.ndarray, vertex_count: int, smoothing: float) -> C
     """Cholesky factor of ``I + smoothing * L`` with the combinatorial Laplacian L of the mesh."""
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-    adjacency = sp.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count))
-    system = (sp.eye(vertex_count) + smoothing * sp.csgraph.laplacian(adjacency + adjacency.T)).tocoo()
+    adjacency = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count))
+    system = (eye(vertex_count) + smoothing * laplacian(adjacency + adjacency.T)).tocoo()
     return CholeskySolverF(vertex_count, system.row.astype(np.int32), system.col.astype(np.int32),
                            system.data.astype(np.float64), MatrixType.COO)
 

@@ -107,8 +107,9 @@ class _Fit:
             with self.progress.stage("export", None), self._timed("export"):
                 metrics = export_fit(self.output, self.scene, joint, self.config, self.checkpoint.seconds)
         except OSError as error:
-            raise UserError(f"'{error.filename or self.output}' cannot be written ({error.strerror or error}); "
-                            f"free some space or mend its permissions, then continue with --resume.") from error
+            raise UserError(f"'{error.filename or self.output}' cannot be written "
+                            f"({error.strerror or error}); free some space or mend its permissions, then "
+                            f"continue with --resume.") from error
         return FitResult(self.output, metrics)
 
     # --- stages
@@ -122,8 +123,8 @@ class _Fit:
             sdf = self._closed_at_border(world.numpy() / _length_scale(self.scene.subject.to_world))
         if not (sdf < 0).any():
             raise UserError(
-                f"The masks of the targets have no common volume in the box of '{self.scene.path}'; check the "
-                f"cameras, the alpha of the targets and the gshell shape's to_world.")
+                f"The masks of the targets have no common volume in the box of '{self.scene.path}'; check "
+                f"the cameras, the alpha of the targets and the gshell shape's to_world.")
         self._enter("ghost", sdf=sdf)
 
     def _closed_at_border(self, sdf: np.ndarray) -> np.ndarray:
@@ -140,8 +141,10 @@ class _Fit:
         self.scene.subject.set_fields(LatticeFields.closed(sdf))
         template = self.scene.subject.template()
         vertices, faces, _ = template.to_numpy()
-        ghost = RadianceGhost(vertices, faces, self.views, PixelPool(self.views, self.scene.targets), self.config)
-        self._iterate("ghost", self.config.ghost_iterations, ghost.step, {"ghost": ghost.optimizer}, {"sdf": sdf})
+        pixels = PixelPool(self.views, self.scene.targets)
+        ghost = RadianceGhost(vertices, faces, self.views, pixels, self.config)
+        self._iterate("ghost", self.config.ghost_iterations, ghost.step, {"ghost": ghost.optimizer},
+                      {"sdf": sdf})
         clean = partial(clean_opacity, vertices=vertices, faces=faces, min_area=self.config.ghost_min_area)
         with self.progress.stage("openings", None), self._timed("ghost"):
             logits = close_unjustified(clean(ghost.smoothed_logits()), faces, ghost.image_error,
@@ -150,8 +153,8 @@ class _Fit:
             opened = logits <= 0
             ghost.refit(~opened)
         if opened.all():
-            raise UserError(f"The radiance ghost found nothing opaque in '{self.scene.path}'; give it more steps "
-                            f"with --ghost-iterations, or check the cameras.")
+            raise UserError(f"The radiance ghost found nothing opaque in '{self.scene.path}'; give it more "
+                            f"steps with --ghost-iterations, or check the cameras.")
         front, _ = ghost.radiance()
         msdf = msdf_from_template(logits, template, self.lattice)
         radiance, known = splat_to_lattice(mi.Float(front.ravel()), template, self.lattice)
@@ -167,7 +170,8 @@ class _Fit:
         light = None
         if not self.config.known_light:
             light = EnvironmentLight.uniform(self.config.light_height, float(start["light"]))
-        reflectance = np.where(start["known"][:, None], start["radiance"] / start["light"], _TYPICAL_REFLECTANCE)
+        reflectance = np.where(start["known"][:, None], start["radiance"] / start["light"],
+                               _TYPICAL_REFLECTANCE)
         joint = JointStage(self.scene, MaterialField(reflectance), light, self.config)
         if self.checkpoint.stage == "joint":
             self._iterate("joint", self.config.iterations, joint.step, joint.optimizers, start)
