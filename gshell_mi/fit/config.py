@@ -43,6 +43,9 @@ class FitConfig:
     ghost_mask: float = 0.003
     """Weight of the mask loss. The image loss also sees the mask; a large weight closes every cap before
     the images can open it."""
+    ghost_daylight: float = 0.1
+    """Weight of coverage where a mask shows daylight through the template: proof of openings, unlike the rest
+    of the mask."""
     ghost_binary: float = 0.01
     """Final weight of the loss that makes opacity decide; ramps up over the second half."""
     ghost_closing: float = 0.0005

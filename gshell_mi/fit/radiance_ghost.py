@@ -73,6 +73,8 @@ class RadianceGhost:
         sample, radiance, alpha, _ = self._render(iteration)
         image = losses.log_l1(radiance, sample.radiance)
         mask = losses.mask_l2(alpha, sample.alpha)
+        # Where a mask shows daylight within the hull, every sheet on the ray is open: no doubt, no balance.
+        daylight = losses.mask_l2(dr.select(sample.alpha < 0.01, alpha, 0), 0)
         opacity = _sigmoid(optimizer["opacity"])
         front, back = (dr.unravel(mi.Color3f, _softplus(optimizer[side])) for side in SIDES)
         # Undecided opacity must have its say first; only then is it made to decide.
@@ -80,6 +82,7 @@ class RadianceGhost:
         total = (
             image
             + self.pixels.mask_weight(config.ghost_mask) * mask
+            + self.pixels.mask_weight(config.ghost_daylight) * daylight
             + late * config.ghost_binary * losses.binary_entropy_bound(opacity)
             + late * config.ghost_closing * losses.transparency(opacity)
             + config.ghost_chroma * losses.chroma_difference(front, back)
