@@ -22,7 +22,7 @@ help:
 	@sed -n 's/^# //p' Makefile | head -3
 
 fit: $(VENV)/.llvm
-	@$(PY) -m gshell_mi.fit $(SCENE) -o $(OUT) $(ARGS)
+	@$(PY) -m gshell_mi.fit $(SCENE) -o $(OUT) --overwrite $(ARGS)
 
 test: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) -m ruff check --quiet .

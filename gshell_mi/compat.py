@@ -6,6 +6,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 #: Major and minor version of Dr.Jit.
 DRJIT_VERSION = tuple(int(part) for part in dr.__version__.split(".")[:2])
@@ -24,6 +25,12 @@ def environment_data(radiance: mi.TensorXf) -> mi.TensorXf:
     row = index // (channels * (width + 2))
     source = (row * width + (column + width - 1) % width) * channels + channel
     return mi.TensorXf(dr.gather(mi.Float, radiance.array, source), (height, width + 2, channels))
+
+
+def environment_radiance(emitter: mi.Emitter) -> np.ndarray:
+    """(height, width, 3) radiance of an ``envmap`` emitter: the inverse of ``environment_data``."""
+    parameters = mi.traverse(emitter)
+    return np.array(parameters["data"])[:, 1:-1, :3] * np.array(parameters["scale"]).ravel()
 
 
 def init_mesh(mesh: Any, props: Any, has_vertex_normals: bool) -> None:

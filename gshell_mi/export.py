@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 import numpy as np
 
+from .compat import environment_radiance
 from .errors import UserError
 from .images import over_white, psnr, triptych, write_png
 from .material import ATTRIBUTES
@@ -179,8 +180,7 @@ def _write_light(path: Path, fit: FitScene, joint: JointStage) -> None:
     else:
         parameters = mi.traverse(fit.light)
         if "data" in parameters:
-            # Mitsuba keeps a copy of the opposite column on either side.
-            bitmap = mi.Bitmap(np.array(parameters["data"])[:, 1:-1, :3] * float(parameters["scale"][0]))
+            bitmap = mi.Bitmap(environment_radiance(fit.light))
         else:
             radiance = np.array(parameters["radiance.value"], np.float32).ravel()
             bitmap = mi.Bitmap(np.broadcast_to(radiance, (8, 16, 3)).astype(np.float32))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from skimage.transform import resize
 
-from .compat import environment_data
+from .compat import environment_data, environment_radiance
 
 #: Radiance below this is raised to it at the start, so that its logarithm exists.
 MINIMUM_RADIANCE = 1e-4
@@ -20,18 +21,33 @@ class EnvironmentLight:
 
     Args:
         radiance: (height, width, 3) linear Rec.709 radiance to start with.
+        to_world: rotation of the map, as an ``envmap`` emitter takes it.
 
     The optimised parameter is ``log_radiance``, a ``TensorXf`` of the same shape.
     """
 
-    def __init__(self, radiance: np.ndarray):
+    def __init__(self, radiance: np.ndarray, to_world: mi.ScalarTransform4f | None = None):
         floor = np.maximum(radiance, MINIMUM_RADIANCE).astype(np.float32)
         self.log_radiance = mi.TensorXf(np.log(floor))
+        self._to_world = to_world or mi.ScalarTransform4f()
 
     @classmethod
     def uniform(cls, height: int, radiance: float) -> EnvironmentLight:
         """The same radiance from everywhere, ``height`` x ``2 height`` texels."""
         return cls(np.full((height, 2 * height, 3), radiance, np.float32))
+
+    @classmethod
+    def from_emitter(cls, emitter: mi.Emitter, height: int) -> EnvironmentLight | None:
+        """The light of an ``envmap`` emitter, averaged to ``height`` rows; None for other emitters.
+
+        A ``constant`` emitter says that nothing is known, not even how bright it is.
+        """
+        parameters = mi.traverse(emitter)
+        if "data" not in parameters:
+            return None
+        radiance = environment_radiance(emitter)
+        shrunk = resize(radiance, (height, 2 * height, 3), order=1, anti_aliasing=radiance.shape[0] > height)
+        return cls(shrunk, mi.ScalarTransform4f(np.array(parameters["to_world"].matrix).reshape(4, 4)))
 
     @property
     def radiance(self) -> mi.TensorXf:
@@ -40,15 +56,9 @@ class EnvironmentLight:
     def emitter(self) -> mi.Emitter:
         """A new ``envmap`` emitter with the present radiance and the id ``light``."""
         return mi.load_dict({"type": "envmap", "id": "light",
+                             "to_world": self._to_world,
                              "bitmap": mi.Bitmap(dr.detach(self.radiance)), "mis_compensation": False})
 
     def update(self, parameters: mi.SceneParameters, key: str = "light.data") -> None:
         """Hands the radiance, attached to the parameter, to the emitter behind ``parameters[key]``."""
         parameters[key] = environment_data(self.radiance)
-
-    def solid_angle_weights(self) -> mi.TensorXf:
-        """(height, width, 1) share of each texel in the sphere; they add up to 1."""
-        height, width, _ = self.log_radiance.shape
-        row = np.sin((np.arange(height) + 0.5) * np.pi / height)
-        weights = np.repeat(row[:, None, None], width, axis=1)
-        return mi.TensorXf((weights / weights.sum()).astype(np.float32))

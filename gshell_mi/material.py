@@ -20,18 +20,22 @@ class MaterialField:
     moves through it, and both sides of a sheet share it.
 
     Args:
-        base_color: (vertex_count, 3) linear Rec.709 reflectance in [0, 1].
+        reflectance: (vertex_count, 3) linear Rec.709 base colour in [0, 1].
+        base_color: one colour instead.
         roughness, metallic: in [0, 1], uniform to start with.
 
     The optimised parameters are the logits in ``parameters``, a dictionary of flat ``mi.Float`` by the
     names of the mesh's attributes; colours are interleaved.
     """
 
-    def __init__(self, base_color: np.ndarray, roughness: float = 0.6, metallic: float = 0.05):
-        count = len(base_color)
+    def __init__(self, reflectance: np.ndarray, *, base_color: np.ndarray | None = None,
+                 roughness: float = 0.6, metallic: float = 0.05):
+        if base_color is not None:
+            reflectance = np.broadcast_to(base_color, reflectance.shape)
+        count = len(reflectance)
         low, high = ROUGHNESS_RANGE
         self.parameters = {
-            "vertex_color": mi.Float(_logit(base_color).astype(np.float32).ravel()),
+            "vertex_color": mi.Float(_logit(reflectance).astype(np.float32).ravel()),
             "vertex_roughness": dr.full(mi.Float, float(_logit((roughness - low) / (high - low))), count),
             "vertex_metallic": dr.full(mi.Float, float(_logit(metallic)), count),
         }
@@ -42,6 +46,18 @@ class MaterialField:
         low, high = ROUGHNESS_RANGE
         unit["vertex_roughness"] = low + (high - low) * unit["vertex_roughness"]
         return unit
+
+
+def given_material(bsdf: mi.BSDF) -> dict:
+    """Uniform values of a ``principled`` BSDF as arguments of ``MaterialField``; empty for other BSDFs."""
+    parameters = mi.traverse(bsdf)
+    found = {}
+    for name in ATTRIBUTES.values():
+        for key in parameters.keys():
+            if key == f"{name}.value" or key.endswith(f".{name}.value"):
+                value = np.array(parameters[key]).ravel()
+                found[name] = value if name == "base_color" else float(value[0])
+    return found
 
 
 def principled() -> dict:

@@ -25,6 +25,7 @@ class FitScene:
         path: the XML file.
         scene: the Mitsuba scene.
         subject: its gshell shape.
+        bsdf: the material that the XML gives the subject.
         light: its emitter ``light`` (``constant`` or ``envmap``).
         sensors: the training views.
         targets: their images, in the same order.
@@ -33,6 +34,7 @@ class FitScene:
     path: Path
     scene: mi.Scene
     subject: mi.Shape
+    bsdf: mi.BSDF
     light: mi.Emitter
     sensors: list[mi.Sensor]
     targets: list[Target]
@@ -76,7 +78,7 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
     if not any(target.rgba[..., 3].any() for target in loaded):
         raise UserError(f"The targets in '{folder}' show no object: their alpha is 0 everywhere; "
                         f"write coverage into it.")
-    return FitScene(path, scene, subject, light, sensors, loaded)
+    return FitScene(path, scene, subject, subject.bsdf(), light, sensors, loaded)
 
 
 def _load(path: Path) -> mi.Scene:

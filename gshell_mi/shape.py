@@ -64,18 +64,21 @@ class GShell(mi.Mesh):
     surface: SurfaceMesh
     """The present mesh in world space, without padding; attached to the fields."""
 
+    filename: str
+    """The file of the initial fields, or an empty string."""
+
     def __init__(self, props: mi.Properties):
         grid = props.get("grid", "tet")
         if grid != "tet":
             raise UserError(f"gshell: grid '{grid}' is not available, only 'tet' is")
         resolution = int(props["resolution"]) if "resolution" in props else None
-        filename = props.get("filename", "")
+        self.filename = props.get("filename", "")
         smooth = not props.get("face_normals", False)
         self.to_world = compat.to_world(props)
         compat.init_mesh(self, props, has_vertex_normals=smooth)
         self._attributes: dict[str, tuple[Any, int]] = {}
         self._mirrored = bool(np.linalg.det(np.array(self.to_world.matrix)[:3, :3]) < 0)
-        self.set_fields(_initial_fields(filename, resolution, self.to_world))
+        self.set_fields(_initial_fields(self.filename, resolution, self.to_world))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         differentiable = mi.ParamFlags.Differentiable
@@ -132,6 +135,10 @@ class GShell(mi.Mesh):
         self.lattice = fields.lattice
         self.sdf, self.msdf, self.deform = (mi.Float(getattr(fields, name)) for name in _FIELDS)
         self._extract()
+
+    def fields(self) -> LatticeFields:
+        """A copy of the present fields on the host."""
+        return LatticeFields(*(np.array(dr.detach(getattr(self, name))) for name in _FIELDS))
 
     def template(self) -> SurfaceMesh:
         """The watertight template of the present fields, in world space."""

@@ -20,7 +20,7 @@ from ..fields import LatticeFields
 from ..fields.visual_hull import visual_hull
 from ..lattice import TetLattice
 from ..light import EnvironmentLight
-from ..material import MaterialField
+from ..material import MaterialField, given_material
 from ..scene import load_fit_scene
 from ..views import PinholeViews
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
@@ -115,6 +115,9 @@ class _Fit:
     # --- stages
 
     def _hull(self) -> None:
+        if self.scene.subject.filename:
+            self._start_from_file()
+            return
         with self.progress.stage("visual hull", len(self.views)) as advance, self._timed("hull"):
             to_world = mi.Transform4f(self.scene.subject.to_world)
             points = to_world @ mi.Point3f(self.lattice.points(mi.Float))
@@ -126,6 +129,18 @@ class _Fit:
                 f"The masks of the targets have no common volume in the box of '{self.scene.path}'; check "
                 f"the cameras, the alpha of the targets and the gshell shape's to_world.")
         self._enter("ghost", sdf=sdf)
+
+    def _start_from_file(self) -> None:
+        """Starts from the fields that the scene's gshell shape was given, openings included."""
+        fields = self.scene.subject.fields().resampled(self.lattice.resolution)
+        if (fields.msdf > 0).all():
+            self._enter("ghost", sdf=fields.sdf)
+            return
+        count = self.lattice.vertex_count
+        brightness = PixelPool(self.views, self.scene.targets).mean_radiance()
+        self._enter("joint", sdf=fields.sdf, msdf=fields.msdf, deform=fields.deform,
+                    radiance=np.zeros((count, 3), np.float32), known=np.zeros(count, bool),
+                    light=np.float32(brightness / _TYPICAL_REFLECTANCE))
 
     def _closed_at_border(self, sdf: np.ndarray) -> np.ndarray:
         """Outside at the cube's faces, so that the template is watertight; finite everywhere."""
@@ -165,14 +180,17 @@ class _Fit:
 
     def _joint(self) -> JointStage:
         start = dict(self.checkpoint.arrays)
-        fields = LatticeFields(start["sdf"], start["msdf"], np.zeros(3 * start["sdf"].size, np.float32))
+        deform = start.get("deform", np.zeros(3 * start["sdf"].size, np.float32))
+        fields = LatticeFields(start["sdf"], start["msdf"], deform)
         self.scene.subject.set_fields(fields)
         light = None
         if not self.config.known_light:
-            light = EnvironmentLight.uniform(self.config.light_height, float(start["light"]))
+            light = (EnvironmentLight.from_emitter(self.scene.light, self.config.light_height)
+                     or EnvironmentLight.uniform(self.config.light_height, float(start["light"])))
         reflectance = np.where(start["known"][:, None], start["radiance"] / start["light"],
                                _TYPICAL_REFLECTANCE)
-        joint = JointStage(self.scene, MaterialField(reflectance), light, self.config)
+        material = MaterialField(reflectance, **given_material(self.scene.bsdf))
+        joint = JointStage(self.scene, material, light, self.config)
         if self.checkpoint.stage == "joint":
             self._iterate("joint", self.config.iterations, joint.step, joint.optimizers, start)
         else:
