@@ -110,7 +110,9 @@ def _the_subject(scene: mi.Scene, path: Path) -> mi.Shape:
 
 def _the_light(scene: mi.Scene, path: Path) -> mi.Emitter:
     found = [emitter for emitter in scene.emitters() if emitter.id() == "light"]
-    if len(found) != 1 or not found[0].is_environment():
+    # What the fit starts from and exports: an image, or one colour.
+    known = len(found) == 1 and not {"data", "radiance.value"}.isdisjoint(mi.traverse(found[0]).keys())
+    if not known or not found[0].is_environment():
         raise UserError(f"Scene '{path}' has no environment emitter with the id 'light'; add "
                         f"<emitter type=\"constant\" id=\"light\"/> or an envmap as the initial lighting.")
     return found[0]

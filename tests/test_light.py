@@ -60,6 +60,25 @@ def test_the_emitter_shines_like_a_stock_one(radiance, stock):
     np.testing.assert_allclose(np.array(look(emitter)), np.array(look(stock)), rtol=1e-4)
 
 
+def test_from_an_emitter(radiance, stock):
+    """A rotated and scaled map starts as it is; a constant says nothing of the light."""
+    rotated = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(radiance), "scale": 2.0,
+                            "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 70)})
+    light = EnvironmentLight.from_emitter(rotated, height=6)
+    np.testing.assert_allclose(np.array(light.radiance), 2 * radiance, rtol=1e-5)
+    np.testing.assert_allclose(np.array(look(light.emitter())), np.array(look(rotated)), rtol=1e-4)
+    assert EnvironmentLight.from_emitter(mi.load_dict({"type": "constant"}), height=6) is None
+
+
+def test_from_an_emitter_of_another_size():
+    ramp = np.broadcast_to(np.linspace(1, 2, 64)[:, None, None], (64, 128, 3)).astype(np.float32)
+    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(ramp))})
+    radiance = np.array(EnvironmentLight.from_emitter(emitter, height=8).radiance)
+    assert radiance.shape == (8, 16, 3)
+    expected = np.broadcast_to(ramp[:, 0, 0].reshape(8, 8).mean(1)[:, None], (8, 16))
+    np.testing.assert_allclose(radiance[1:-1, :, 0], expected[1:-1], rtol=0.01)
+
+
 def test_and_so_it_does_after_an_update(radiance, stock):
     scene = mi.load_dict({"type": "scene", "light": EnvironmentLight.uniform(6, 1.0).emitter()})
     parameters = mi.traverse(scene)

@@ -1,0 +1,118 @@
+"""Cutting a template open: which cuts are kept, and where the rim comes to lie."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from topology import assert_manifold, loop_count
+
+from gshell_mi.extraction import extract
+from gshell_mi.fields import sphere
+from gshell_mi.fit.opening import clean_opacity, close_unjustified, msdf_from_template, splat_to_lattice
+from gshell_mi.lattice import TetLattice
+
+
+@pytest.fixture(scope="module")
+def ball() -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(4)
+
+
+def cap(ball: trimesh.Trimesh, axis, share: float) -> np.ndarray:
+    """Vertices in a cap with this share of the sphere's area."""
+    return ball.vertices @ np.array(axis, float) > 1 - 2 * share
+
+
+def test_small_cuts_and_islands_are_undone(ball):
+    big, small = cap(ball, [0, 0, 1], 0.2), cap(ball, [1, 0, 0], 0.004)
+    island = cap(ball, [0, 0, 1], 0.004)
+    logits = np.where((big & ~island) | small, -2.0, 3.0)
+    before = logits.copy()
+    cleaned = clean_opacity(logits, ball.vertices, ball.faces, min_area=0.02)
+    np.testing.assert_array_equal(cleaned <= 0, big)
+    np.testing.assert_array_equal(np.abs(cleaned), np.abs(before))
+    np.testing.assert_array_equal(logits, before)
+
+
+def test_large_patches_stay(ball):
+    logits = np.where(cap(ball, [0, 0, 1], 0.05) | cap(ball, [0, -1, 0], 0.1), -1.0, 1.0)
+    np.testing.assert_array_equal(clean_opacity(logits, ball.vertices, ball.faces, min_area=0.02), logits)
+
+
+def test_an_island_in_a_small_cut_is_just_surface(ball):
+    logits = np.where(cap(ball, [0, 0, 1], 0.015) & ~cap(ball, [0, 0, 1], 0.004), -1.0, 1.0)
+    assert (clean_opacity(logits, ball.vertices, ball.faces, min_area=0.02) > 0).all()
+
+
+def test_an_opening_stays_if_it_explains_the_images(ball):
+    """Two openings: through the upper one the error falls to a half, through the lower one to 0.9."""
+    up, down = cap(ball, [0, 0, 1], 0.1), cap(ball, [0, 0, -1], 0.1)
+    logits = np.where(up | down, -1.0, 2.0)
+    asked = []
+
+    def error(opaque):
+        asked.append(opaque)
+        return np.where(opaque, 1.0, np.where(up, 0.5, 0.9))
+
+    result = close_unjustified(logits, ball.faces, error, gain=0.8)
+    np.testing.assert_array_equal(result <= 0, up)
+    np.testing.assert_array_equal(np.abs(result), np.abs(logits))
+    assert asked[0].all(), "compared with the closed template"
+    np.testing.assert_array_equal(asked[1], logits > 0)
+    np.testing.assert_array_equal(close_unjustified(logits, ball.faces, error, gain=0.95), logits)
+
+
+def test_the_error_counts_per_opening_not_per_vertex(ball):
+    """Half of an opening's vertices may get worse if the other half gains more."""
+    up = cap(ball, [0, 0, 1], 0.1)
+    half = up & (ball.vertices[:, 0] > 0)
+    logits = np.where(up, -1.0, 1.0)
+
+    def error(opaque):
+        return np.where(opaque, 1.0, np.where(half, 1.1, 0.1))
+
+    np.testing.assert_array_equal(close_unjustified(logits, ball.faces, error, gain=0.8), logits)
+
+
+def test_nothing_open_nothing_asked(ball):
+    logits = np.ones(len(ball.vertices))
+    assert close_unjustified(logits, ball.faces, None, gain=0.8) is logits
+
+
+@pytest.mark.parametrize("height", [-0.21, 0.0, 0.337])
+def test_the_rim_lies_where_the_logits_change_sign(height):
+    lattice = TetLattice(24)
+    fields = sphere(lattice, 0.7)
+    sdf, closed, still = (mi.Float(a) for a in (fields.sdf, fields.msdf, fields.deform))
+    template = extract(lattice, sdf, closed, still, template=True).template
+    vertices, _, _ = template.to_numpy()
+    logits = (height - vertices[:, 1]) / lattice.spacing
+    surface = extract(lattice, sdf, msdf_from_template(logits, template, lattice), still)
+    vertices, faces, msdf = surface.to_numpy()
+    assert_manifold(vertices, faces)
+    assert loop_count(faces) == 1
+    error = (vertices[msdf == 0, 1] - height) / lattice.spacing
+    assert len(error) > 40 and np.abs(error).max() < 0.25 and np.abs(error.mean()) < 0.05
+    assert vertices[:, 1].max() < height + 0.25 * lattice.spacing and vertices[:, 1].min() < -0.69
+
+
+def test_all_solid_stays_closed():
+    lattice = TetLattice(12)
+    fields = sphere(lattice)
+    sdf, closed, still = (mi.Float(a) for a in (fields.sdf, fields.msdf, fields.deform))
+    template = extract(lattice, sdf, closed, still, template=True).template
+    msdf = msdf_from_template(np.full(template.vertex_count, 8.0), template, lattice)
+    _, faces, _ = extract(lattice, sdf, msdf, still).to_numpy()
+    assert loop_count(faces) == 0 and len(faces) == template.face_count
+    assert msdf.numpy().max() <= 3 * lattice.spacing * 1.001, "certainty is limited"
+
+
+def test_splatted_constants_come_back():
+    lattice = TetLattice(12)
+    fields = sphere(lattice)
+    mesh = extract(lattice, *(mi.Float(a) for a in (fields.sdf, fields.msdf, fields.deform)), template=True)
+    template = mesh.template
+    colors = mi.Float(np.tile([0.2, 0.5, 0.9], template.vertex_count).astype(np.float32))
+    field, known = splat_to_lattice(colors, template, lattice)
+    assert known.numpy()[np.abs(fields.sdf) < 2 * lattice.spacing].all()
+    back = template.interpolate(field, 3).numpy()
+    np.testing.assert_allclose(back.T, np.tile([0.2, 0.5, 0.9], (template.vertex_count, 1)), rtol=1e-4)
