@@ -73,7 +73,7 @@ def measure(case, resolution, quick, stock=True):
         try:
             extra = {"max_depth": case.depth} if name == "prb_projective" else {}
             integrator = mi.load_dict({"type": name, "hide_emitters": case.hide_emitters, **extra})
-            images = [gradient_scenes.forward_image(mover, integrator, 16, seed) for seed in range(4)]
+            images = [gradient_scenes.forward_image(mover, integrator, 8, seed) for seed in range(3)]
             row["stock"][name] = (*mean_and_error(total(images)),
                                   correlation(reference.mean(0), np.mean(images, 0)))
         except Exception as error:    # a stock integrator that cannot do a scene is a result
@@ -109,7 +109,7 @@ of the stock `path` integrator with equal seeds on both sides; figures after ± 
 `gshell_path` uses `reparam_depth` = depth. "Right" means: bias within 1 % of the derivative or within two
 standard errors. "Corr." is the correlation of the gradient image with that of finite differences (both
 blurred by one pixel); "fwd - rev" the relative difference of forward and reverse mode with one seed. The last
-two columns show Mitsuba's projective integrators with default settings at 16 spp (in brackets their
+two columns show Mitsuba's projective integrators with default settings at 8 spp (in brackets their
 correlation).
 
 """

@@ -91,7 +91,7 @@ class GShellPathIntegrator(ADIntegrator):
         depth = mi.UInt32(start)
         L, beta, eta = mi.Spectrum(0), mi.Spectrum(1), mi.Float(1)
         active = mi.Bool(active)
-        covered = mi.Bool(not self.hide_emitters and scene.environment() is not None)
+        scattered = mi.Bool(start > 0)     # past the surfaces that camera rays just pass through
         if dr.hint(start == 0, mode="scalar"):
             pi = self._first_hit(scene, ray, active)
         else:
@@ -105,12 +105,12 @@ class GShellPathIntegrator(ADIntegrator):
             shines = active
             if dr.hint(start > 0, mode="scalar"):
                 shines = active & ~((depth == start) & si.is_valid())
-            L += beta * self._emission(scene, si, si_prev, pdf_prev, delta_prev, depth, shines)
+            L += beta * self._emission(scene, si, si_prev, pdf_prev, delta_prev, scattered, shines)
             active_next = active & (depth + 1 < self.max_depth) & si.is_valid()
             L += beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, False, False)
             sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(),
                                          active_next)
-            covered |= active & si.is_valid() & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
+            scattered |= active & si.is_valid() & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
             ray = si.spawn_ray(si.to_world(sample.wo))
             beta *= weight
             eta *= sample.eta
@@ -121,12 +121,13 @@ class GShellPathIntegrator(ADIntegrator):
             depth[si.is_valid()] += 1
             active = active_next
 
+        covered = scattered | (not self.hide_emitters and scene.environment() is not None)
         return PathSample(L, dr.select(covered, mi.Float(1), mi.Float(0)), [])
 
-    def _emission(self, scene, si, si_prev, pdf_prev, delta_prev, depth, active):
+    def _emission(self, scene, si, si_prev, pdf_prev, delta_prev, scattered, active):
         """Light emitted at a vertex towards the one before, weighted against emitter sampling."""
         if self.hide_emitters:
-            active = active & ~((depth == 0) & ~si.is_valid())
+            active = active & (scattered | si.is_valid())
         ds = mi.DirectionSample3f(scene, si=dr.detach(si), ref=si_prev)
         emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, ~delta_prev)
         return mis_weight(pdf_prev, emitter_pdf) * ds.emitter.eval(si, active)
@@ -241,7 +242,8 @@ class GShellPathIntegrator(ADIntegrator):
         bsdf = si.bsdf(mi.RayDifferential3f(dr.detach(ray)))
         active = mi.Bool(True)
         no_vertex = dr.zeros(mi.SurfaceInteraction3f)
-        radiance = self._emission(scene, si, no_vertex, mi.Float(1), mi.Bool(True), depth, active)
+        radiance = self._emission(scene, si, no_vertex, mi.Float(1), mi.Bool(True), mi.Bool(False), active)
+        scattered = mi.Bool(False)
         throughput = mi.Spectrum(1)     # of value 1, carries the derivatives of the vertices so far
         beta, eta, alpha = mi.Spectrum(1), mi.Float(1), state.alpha
 
@@ -250,13 +252,12 @@ class GShellPathIntegrator(ADIntegrator):
             si_now = dr.detach(si)
             radiance += throughput * beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active, True,
                                                           surface_emitters)
-            if vertex == 1 and not deeper:
-                break
             choice, sample2 = sampler.next_1d(), sampler.next_2d()
             with dr.suspend_grad():
                 sample, weight = bsdf.sample(context, si_now, choice, sample2, active)
                 ray_next = si_now.spawn_ray(si_now.to_world(sample.wo))
                 delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+                scattered |= ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
                 eta *= sample.eta
                 beta, active = self._roulette(beta * weight, eta, depth, sampler, active)
                 pi = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active)
@@ -265,9 +266,13 @@ class GShellPathIntegrator(ADIntegrator):
             if surface_emitters or vertex == 1:
                 p_next, area_next = material_point(pi, ray_next, active)
                 d, solid_angle = segment(si.p, p_next, area_next, active & pi.is_valid(), ray_next.d)
-                value = bsdf.eval(context, si, si.to_local(d), active)
-                to_point = throughput * dr.relative_grad(value) * solid_angle
+                to_point = throughput * self._scattering(bsdf, si, d, solid_angle, sample, active, special)
             if vertex == 1:
+                if not deeper:    # else the replay counts what the last vertex emits
+                    last = pi.compute_surface_interaction(
+                        ray_next, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+                    radiance += to_point * beta * self._emission(scene, last, si_now, sample.pdf, delta,
+                                                                 scattered, active)
                 break
             # Light of emitters arrives from a point of theirs, all other along a fixed direction: in
             # these forms the integrand moves least, and emitter sampling uses the same.
@@ -280,7 +285,7 @@ class GShellPathIntegrator(ADIntegrator):
                 along.d = dr.replace_grad(ray_next.d, d)
             throughput = throughput * change
             si_next = pi.compute_surface_interaction(along, mi.RayFlags.All, active)
-            emitted = beta * self._emission(scene, si_next, si_now, sample.pdf, delta, depth, active)
+            emitted = beta * self._emission(scene, si_next, si_now, sample.pdf, delta, scattered, active)
             if surface_emitters:
                 emitted *= dr.select(pi.is_valid() & ~delta, to_point, throughput)
             else:
@@ -289,11 +294,23 @@ class GShellPathIntegrator(ADIntegrator):
             si, bsdf = si_next, si_next.bsdf(mi.RayDifferential3f(dr.detach(ray_next)))
 
         if not deeper:
-            return radiance, alpha, dr.detach(si.p), None
+            return radiance, alpha, mi.Point3f(0), None
         rest = state.value - dr.detach(radiance)
         radiance += dr.select(active, to_point * rest, 0)
         return radiance, alpha, si.p, (scene, sampler, ray_next, pi, si_now, rest, beta, eta, sample.pdf,
-                                       delta, active, depth)
+                                       delta, active, depth, scattered)
+
+    def _scattering(self, bsdf, si, d, solid_angle, sample, active, special):
+        """Factor of value 1 with the derivative of scattering towards a point.
+
+        Where light just passes through (``mask``), of the transmission; the geometry of such a
+        segment is that of the surfaces at its ends and is left out.
+        """
+        change = dr.relative_grad(bsdf.eval(mi.BSDFContext(), si, si.to_local(d), active)) * solid_angle
+        if not special:
+            return change
+        passes = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
+        return dr.select(passes, dr.relative_grad(bsdf.eval_null_transmission(si, active)), change)
 
     def _delta_lobe(self, bsdf, si, ray, ray_next, choice, sample2, delta, active, kind, change, alpha):
         """Direction, relative weight and coverage where the first surface scatters in one direction.
@@ -314,20 +331,21 @@ class GShellPathIntegrator(ADIntegrator):
 
     @dr.syntax
     def _replay(self, mode, scene, sampler, ray, pi, si_prev, L, beta, eta, pdf_prev, delta_prev, active,
-                depth, adjoint, p_tangent):
+                depth, scattered, adjoint, p_tangent):
         """Path replay (Vicini et al. 2021) of the remaining vertices.
 
         Reverse mode takes the adjoint of the radiance and returns that of the position of the vertex
         before; forward mode takes the tangent of that position and returns the radiance's.
         """
         surface_emitters = _has_surface_emitters(scene)
+        special = _has_bsdf_flag(scene, mi.BSDFFlags.Delta)
         backward = mode == dr.ADMode.Backward
         depth, start = mi.UInt32(depth), mi.UInt32(depth)
         tangent = mi.Spectrum(0)
         on_first = mi.Vector3f(0)
         first_p = mi.Point3f(si_prev.p)
         pi_prev, ray_prev = dr.zeros(mi.PreliminaryIntersection3f, dr.width(pi)), mi.Ray3f(ray)
-        active = mi.Bool(active)
+        active, scattered = mi.Bool(active), mi.Bool(scattered)
 
         while dr.hint(active, max_iterations=self.max_depth - 2, label="gshell_path (replay)"):
             second = depth == start
@@ -342,7 +360,7 @@ class GShellPathIntegrator(ADIntegrator):
                 si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
                 wi = si.to_local(dr.normalize(p_prev - si.p))
                 si.wi = dr.replace_grad(si.wi, dr.select(si.is_valid(), wi, si.wi))
-                emitted = beta * self._emission(scene, si, si_prev, pdf_prev, delta_prev, depth, active)
+                emitted = beta * self._emission(scene, si, si_prev, pdf_prev, delta_prev, scattered, active)
             si_now = dr.detach(si)
             bsdf = si_now.bsdf(mi.RayDifferential3f(ray))
             active_next = active & (depth + 1 < self.max_depth) & si_now.is_valid()
@@ -361,8 +379,8 @@ class GShellPathIntegrator(ADIntegrator):
                 p_next, area_next = material_point(pi_next, ray_next, active_next)
                 d, solid_angle = segment(si.p, p_next, area_next, active_next & pi_next.is_valid(),
                                          ray_next.d)
-                value = bsdf.eval(mi.BSDFContext(), si, si.to_local(d), active_next)
-                indirect = dr.select(active_next, L * dr.relative_grad(value) * solid_angle, 0)
+                change = self._scattering(bsdf, si, d, solid_angle, sample, active_next, special)
+                indirect = dr.select(active_next, L * change, 0)
                 radiance = emitted + direct + indirect
                 if dr.hint(backward, mode="scalar"):
                     dr.backward_from(adjoint * radiance)
@@ -370,6 +388,7 @@ class GShellPathIntegrator(ADIntegrator):
                 else:
                     tangent += dr.forward_to(radiance)
             si_prev = si_now
+            scattered |= active & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
             pdf_prev, delta_prev = sample.pdf, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
             depth[si_now.is_valid()] += 1
             pi_prev, pi = pi, pi_next
