@@ -77,9 +77,10 @@ def test_no_recompilation_when_sizes_change():
         dr.backward(dr.sum(mi.render(scene, params, integrator=integrator, spp=4, seed=seed)))
         assert np.isfinite(np.array(dr.grad(params["subject.vertex_positions"]))).all()
 
-    for n in (5, 6, 7):
+    # Some kernels come in two variants, by what happens to be pending when they are launched.
+    for n in (5, 6, 7, 8, 9, 11):
         iterate(n, n)
-    recompiled, launched = compiled(lambda: [iterate(n, 100 + n) for n in (8, 11, 13, 17, 19)])
+    recompiled, launched = compiled(lambda: [iterate(n, 100 + n) for n in (10, 12, 13, 14, 17)])
     assert launched > 20
     assert recompiled == 0
 
