@@ -41,7 +41,7 @@ def two_sheets() -> tuple[np.ndarray, np.ndarray]:
 def unused_views():
     sensor = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": 2, "height": 2}})
     views = PinholeViews.from_sensors([sensor])
-    return views, PixelPool(views, [Target(None, np.ones((2, 2, 4), np.floatSEGMENTS), True)])
+    return views, PixelPool(views, [Target(None, np.ones((2, 2, 4), np.float32), True)])
 
 
 @pytest.fixture(scope="module")
