@@ -51,12 +51,18 @@ _SCENE = """\
     <sensor type="perspective" id="{sensor_id}">
         <float name="fov" value="{fov}"/>
         <string name="fov_axis" value="x"/>
+        <float name="principal_point_offset_x" value="{principal_x}"/>
+        <float name="principal_point_offset_y" value="{principal_y}"/>
         <transform name="to_world">
             <matrix value="{to_world}"/>
         </transform>
         <film type="hdrfilm">
             <integer name="width" value="{width}"/>
             <integer name="height" value="{height}"/>
+            <integer name="crop_width" value="{crop_width}"/>
+            <integer name="crop_height" value="{crop_height}"/>
+            <integer name="crop_offset_x" value="{crop_x}"/>
+            <integer name="crop_offset_y" value="{crop_y}"/>
             <string name="pixel_format" value="rgba"/>
         </film>
     </sensor>
@@ -194,7 +200,13 @@ def _write_scene(path: Path, fit: FitScene) -> None:
         f'                </texture>' for attribute, parameter in ATTRIBUTES.items())
     sensor = fit.sensors[0]
     parameters = mi.traverse(sensor)
-    width, height = sensor.film().crop_size()
+    film = sensor.film()
+    (width, height), (crop_width, crop_height) = film.size(), film.crop_size()
+    crop_x, crop_y = film.crop_offset()
+    # A thin lens has no principal point.
+    principal_x, principal_y = (
+        float(np.ravel(parameters[name])[0]) if name in parameters else 0.0
+        for name in ("principal_point_offset_x", "principal_point_offset_y"))
     light_to_world = ""
     light = mi.traverse(fit.light)
     if "to_world" in light:
@@ -203,7 +215,8 @@ def _write_scene(path: Path, fit: FitScene) -> None:
     path.write_text(_SCENE.format(
         depth=_EXPORT_DEPTH, textures=textures, light_to_world=light_to_world, sensor_id=sensor.id(),
         fov=float(parameters["x_fov"][0]), to_world=_matrix(parameters["to_world"].matrix),
-        width=width, height=height))
+        principal_x=principal_x, principal_y=principal_y, width=width, height=height, crop_width=crop_width,
+        crop_height=crop_height, crop_x=crop_x, crop_y=crop_y))
 
 
 def _matrix(matrix) -> str:

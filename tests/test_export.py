@@ -1,0 +1,234 @@
+"""What a fit leaves behind, as other programs read it."""
+
+import json
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from bowl import SIZE, VIEWS
+from PIL import Image
+from topology import loop_count
+
+from gshell_mi import UserError
+from gshell_mi.export import (
+    _write_light,
+    _write_mesh,
+    _write_scene,
+    check_output_folder,
+    export_fit,
+    make_output_folder,
+)
+from gshell_mi.fields import LatticeFields, sphere
+from gshell_mi.fit.config import FitConfig
+from gshell_mi.fit.joint import JointStage
+from gshell_mi.lattice import TetLattice
+from gshell_mi.light import EnvironmentLight
+from gshell_mi.material import MaterialField
+from gshell_mi.scene import load_fit_scene
+
+LATTICE = TetLattice(16)
+
+
+@pytest.fixture(scope="module")
+def exported(bowl_scene, tmp_path_factory):
+    """The folder, the stage and the metrics of a sphere cut open at the top, in many colours."""
+    output = tmp_path_factory.mktemp("exported")
+    fit = load_fit_scene(bowl_scene)
+    ball = sphere(LATTICE, 0.6)
+    position = LATTICE.vertex_positions()
+    fit.subject.set_fields(LatticeFields(ball.sdf, 0.3 - position[:, 1], ball.deform))
+    material = MaterialField(0.5 + 0.4 * position, roughness=0.3, metallic=0.1)
+    radiance = np.random.default_rng(0).uniform(0.2, 2, (8, 16, 3))
+    config = FitConfig(spp=1, primal_spp=1)
+    joint = JointStage(fit, material, EnvironmentLight(radiance), config)
+    joint.finish()
+    metrics = export_fit(output, fit, joint, config, {"hull": 1.5, "joint": 2.0})
+    return SimpleNamespace(output=output, fit=fit, joint=joint, metrics=metrics, radiance=radiance)
+
+
+@pytest.fixture(scope="module")
+def mesh(exported) -> trimesh.Trimesh:
+    return trimesh.load(exported.output / "mesh.ply", process=False)
+
+
+def attribute(mesh, name: str, channels: int) -> np.ndarray:
+    data = mesh.metadata["_ply_raw"]["vertex"]["data"]
+    return np.stack([np.ravel(data[f"{name}_{channel}"]) for channel in range(channels)], axis=1)
+
+
+def test_mesh_in_trimesh(exported, mesh):
+    vertices, faces, _ = exported.fit.subject.surface.to_numpy()
+    np.testing.assert_array_equal(np.asarray(mesh.vertices, np.float32), vertices)
+    np.testing.assert_array_equal(mesh.faces, faces)
+    assert loop_count(mesh.faces) == 1 and not mesh.is_watertight
+    np.testing.assert_allclose(attribute(mesh, "color", 3), 0.5 + 0.4 * vertices, atol=1e-2)
+    np.testing.assert_allclose(attribute(mesh, "roughness", 1), 0.3, atol=1e-5)
+    np.testing.assert_allclose(attribute(mesh, "metallic", 1), 0.1, atol=1e-5)
+
+
+def test_normals_are_unit_and_point_outwards(mesh):
+    data = mesh.metadata["_ply_raw"]["vertex"]["data"]
+    normals = np.stack([np.ravel(data[name]) for name in ("nx", "ny", "nz")], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    radial = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    assert (normals * radial).sum(1).min() > 0.9
+
+
+def test_mesh_in_stock_mitsuba(exported, mesh):
+    shape = mi.load_dict({"type": "ply", "filename": str(exported.output / "mesh.ply")})
+    parameters = mi.traverse(shape)
+    assert (shape.vertex_count(), shape.face_count()) == (len(mesh.vertices), len(mesh.faces))
+    np.testing.assert_array_equal(np.array(parameters["faces"]).reshape(-1, 3), mesh.faces)
+    for name, channels in (("color", 3), ("roughness", 1), ("metallic", 1)):
+        values = np.array(parameters[f"vertex_{name}"]).reshape(-1, channels)
+        np.testing.assert_array_equal(values, attribute(mesh, name, channels).astype(np.float32))
+
+
+def test_template_is_closed_and_carries_the_msdf(exported):
+    template = trimesh.load(exported.output / "template.ply", process=False)
+    assert template.is_watertight and template.volume > 0
+    msdf = attribute(template, "msdf", 1)[:, 0]
+    np.testing.assert_allclose(msdf, 0.3 - template.vertices[:, 1], atol=1e-5)
+
+
+def test_light(exported):
+    stored = np.array(mi.Bitmap(str(exported.output / "light.exr")))
+    np.testing.assert_allclose(stored, exported.radiance, rtol=1e-3)
+
+
+def test_scene_is_the_fitted_one(exported):
+    """Stock Mitsuba sees from the first view what the fit's own scene shows there."""
+    scene = mi.load_file(str(exported.output / "scene.xml"))
+    assert [shape.class_name() for shape in scene.shapes()] == ["PLYMesh"]
+    (sensor,) = scene.sensors()
+    first = exported.fit.sensors[0]
+    assert sensor.id() == first.id() == "view_000"
+    film = mi.Point2f([0.1, 0.5, 0.9], [0.3, 0.5, 0.8])
+    ours, theirs = (s.sample_ray(0, 0.5, film, mi.Point2f(0.5))[0] for s in (sensor, first))
+    np.testing.assert_allclose(np.array(ours.o), np.array(theirs.o), atol=1e-5)
+    np.testing.assert_allclose(np.array(ours.d), np.array(theirs.d), atol=1e-5)
+    integrator = mi.load_dict({"type": "path", "max_depth": 3, "hide_emitters": True})
+    here = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=64, seed=1))
+    there = np.array(mi.render(exported.joint.scene, sensor=first, integrator=integrator, spp=64, seed=2))
+    assert here.shape == there.shape == (SIZE, SIZE, 4)
+    np.testing.assert_allclose(here.mean((0, 1)), there.mean((0, 1)), rtol=0.02)
+    assert np.abs(here - there).mean() < 0.03
+
+
+SENSORS = {
+    "fov along y": {"type": "perspective", "fov": 50, "fov_axis": "y"},
+    "principal point": {"type": "perspective", "fov": 35, "principal_point_offset_x": 0.1,
+                        "principal_point_offset_y": -0.2},
+}
+
+
+@pytest.mark.parametrize("crop", [False, True])
+@pytest.mark.parametrize("kind", SENSORS)
+def test_any_perspective_sensor_survives(exported, tmp_path, kind, crop):
+    film = {"type": "hdrfilm", "width": 64, "height": 48}
+    if crop:
+        film |= {"crop_width": 20, "crop_height": 12, "crop_offset_x": 30, "crop_offset_y": 9}
+    to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0.1, 0, 0], [0, 1, 0])
+    sensor = mi.load_dict(SENSORS[kind] | {"to_world": to_world, "film": film, "id": "view_007"})
+    for name in ("mesh.ply", "light.exr"):
+        (tmp_path / name).write_bytes((exported.output / name).read_bytes())
+    _write_scene(tmp_path / "scene.xml", SimpleNamespace(sensors=[sensor], light=exported.fit.light))
+    (written,) = mi.load_file(str(tmp_path / "scene.xml")).sensors()
+    assert written.id() == "view_007"
+    assert tuple(written.film().crop_size()) == tuple(sensor.film().crop_size())
+    at = mi.Point2f(np.random.default_rng(3).random((2, 50)).astype(np.float32))
+    ours, theirs = (s.sample_ray(0, 0.5, at, mi.Point2f(0.5))[0] for s in (written, sensor))
+    np.testing.assert_allclose(np.array(ours.d), np.array(theirs.d), atol=1e-5)
+
+
+def look(emitter) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    si = mi.SurfaceInteraction3f()
+    direction = rng.normal(size=(3, 200))
+    si.wi = -mi.Vector3f((direction / np.linalg.norm(direction, axis=0)).astype(np.float32))
+    return np.broadcast_to(np.array(emitter.eval(si)), (3, 200))
+
+
+@pytest.mark.parametrize("light", [
+    {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1.0, 2.0]}},
+    {"type": "envmap", "scale": 2.0, "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 70)},
+], ids=["constant", "rotated map"])
+@pytest.mark.parametrize("optimised", [False, True])
+def test_light_survives(exported, tmp_path, light, optimised):
+    if light["type"] == "envmap":
+        light = light | {"bitmap": mi.Bitmap(exported.radiance.astype(np.float32))}
+    emitter = mi.load_dict(light)
+    found = EnvironmentLight.from_emitter(emitter, 8) if optimised else None
+    if optimised and found is None:
+        found = EnvironmentLight(exported.radiance)
+        emitter = found.emitter()
+    fit = SimpleNamespace(light=mi.load_dict(light), sensors=exported.fit.sensors)
+    _write_light(tmp_path / "light.exr", fit, SimpleNamespace(light=found))
+    _write_scene(tmp_path / "scene.xml", fit)
+    (tmp_path / "mesh.ply").write_bytes((exported.output / "mesh.ply").read_bytes())
+    written = mi.load_file(str(tmp_path / "scene.xml")).environment()
+    np.testing.assert_allclose(look(written), look(emitter), rtol=2e-3)
+
+
+def test_views(exported):
+    names = {path.name for path in (exported.output / "views").iterdir()}
+    assert names == {f"view_{i:03}.png" for i in range(VIEWS)}
+    image = np.array(Image.open(exported.output / "views" / "view_000.png"))
+    assert image.shape == (SIZE, 3 * SIZE, 3)
+
+
+def test_metrics(exported, mesh):
+    stored = json.loads((exported.output / "metrics.json").read_text())
+    assert stored == exported.metrics
+    counts = stored["counts"]
+    assert (counts["vertices"], counts["faces"]) == (len(mesh.vertices), len(mesh.faces))
+    assert (counts["boundary_loops"], counts["components"], counts["nonmanifold_edges"]) == (1, 1, 0)
+    assert stored["seconds"] == {"hull": 1.5, "joint": 2.0, "total": 3.5}
+    assert set(stored["psnr_per_view"]) == {f"view_{i:03}" for i in range(VIEWS)}
+    assert stored["config"]["spp"] == 1 and stored["variant"] == mi.variant()
+
+
+def test_empty_mesh(tmp_path):
+    attributes = {"vertex_color": np.zeros((0, 3)), "vertex_roughness": np.zeros(0)}
+    _write_mesh(tmp_path / "mesh.ply", np.zeros((0, 3)), np.zeros((0, 3), int), attributes)
+    header = (tmp_path / "mesh.ply").read_text()
+    assert "element vertex 0\n" in header and "element face 0\n" in header and header.endswith("end_header\n")
+
+
+def test_unused_and_flat_vertices_have_no_nan_among_their_normals(tmp_path):
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]], np.float32)
+    _write_mesh(tmp_path / "mesh.ply", vertices, np.array([[0, 1, 2]]), {})
+    data = trimesh.load(tmp_path / "mesh.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
+    assert all(np.isfinite(data[name]).all() for name in ("nx", "ny", "nz"))
+
+
+# --- the folder
+
+
+def test_folder_is_made_and_only_a_fits_own_files_go(tmp_path):
+    output = tmp_path / "a" / "b"
+    check_output_folder(output, keep=False, overwrite=False)
+    assert not (tmp_path / "a").exists(), "a check leaves no trace"
+    make_output_folder(output, keep=False)
+    for name in ("notes.txt", "mesh.ply", "checkpoint.npz"):
+        (output / name).write_text(name)
+    (output / "views").mkdir()
+    (output / "views" / "view_000.png").write_text("")
+    with pytest.raises(UserError, match=r"holds an earlier fit \(mesh.ply\)"):
+        check_output_folder(output, keep=False, overwrite=False)
+    check_output_folder(output, keep=True, overwrite=False)
+    make_output_folder(output, keep=True)
+    assert len(list(output.iterdir())) == 4
+    check_output_folder(output, keep=False, overwrite=True)
+    make_output_folder(output, keep=False)
+    assert [path.name for path in output.iterdir()] == ["notes.txt"]
+
+
+def test_folder_below_a_file(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"cannot be made because '.*file' is a file"):
+        check_output_folder(tmp_path / "file" / "out", keep=False, overwrite=False)
+    with pytest.raises(UserError, match="cannot be written"):
+        make_output_folder(tmp_path / "file" / "out", keep=False)
