@@ -55,8 +55,10 @@ def compiled(run):
         dr.kernel_history_clear()
         run()
         history = dr.kernel_history([dr.KernelType.JIT])
-    # A kernel that an earlier process left on disk is new to this one all the same.
-    return sum(not e["cache_hit"] or e["cache_disk"] for e in history), len(history)
+    # A kernel that an earlier process left on disk is new to this one all the same. Arrays of a single
+    # entry are scalars to Dr.Jit and have kernels of their own.
+    new = [e for e in history if (not e["cache_hit"] or e["cache_disk"]) and e["size"] > 1]
+    return len(new), len(history)
 
 
 def test_no_recompilation_when_sizes_change():
@@ -77,12 +79,13 @@ def test_no_recompilation_when_sizes_change():
         dr.backward(dr.sum(mi.render(scene, params, integrator=integrator, spp=4, seed=seed)))
         assert np.isfinite(np.array(dr.grad(params["subject.vertex_positions"]))).all()
 
-    # Some kernels come in two variants, by what happens to be pending when they are launched.
-    for n in (5, 6, 7, 8, 9, 11):
+    for n in (5, 6, 7):
         iterate(n, n)
-    recompiled, launched = compiled(lambda: [iterate(n, 100 + n) for n in (10, 12, 13, 14, 17)])
-    assert launched > 20
-    assert recompiled == 0
+    counts = [compiled(lambda n=n: iterate(n, 100 + n)) for n in (8, 9, 10, 11, 12, 13, 14, 17)]
+    assert min(launched for _, launched in counts) > 20
+    # A few kernels come in two variants, the second of which turns up in one of the iterations; a size
+    # that was part of a kernel would compile it in all of them.
+    assert sum(recompiled > 0 for recompiled, _ in counts) <= 1
 
 
 @pytest.mark.slow
