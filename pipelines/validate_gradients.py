@@ -143,7 +143,7 @@ def main():
     parser.add_argument("--scenes", nargs="*", help="names of scenes; the page is only written for all")
     parser.add_argument("--resolution", type=int, default=64, help="pixels per side (default 64)")
     parser.add_argument("--quick", action="store_true", help="a quarter of the samples")
-    parser.add_argument("--ours", action="store_true", help="leave out the stock integrators, and the page")
+    parser.add_argument("--ours", action="store_true", help="leave out the stock integrators")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default llvm_ad_rgb)")
     arguments = parser.parse_args()
     mi.set_variant(arguments.variant)
@@ -155,7 +155,7 @@ def main():
         rows.append(row)
         images[case.name] = (reference, ours)
         print(format_row(row), flush=True)
-        if not (arguments.scenes or arguments.ours):
+        if not arguments.scenes:
             write_page(rows, images, arguments.resolution, arguments.quick)
 
 

@@ -83,10 +83,6 @@ class EdgeTable:
     split: object       #: ``Bool``, 3F: its faces have different copies of an end point (at representatives)
     degree: object      #: ``Int32``, 3F: number of faces at the edge, stored at its representative
 
-    @property
-    def face_count(self) -> int:
-        return dr.width(self.start) // 3
-
 
 def build_edge_table(positions, faces) -> EdgeTable:
     """The edges of a mesh, vertices at exactly the same position counting as one.

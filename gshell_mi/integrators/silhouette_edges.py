@@ -18,9 +18,6 @@ class ScreenEdges:
     a: object       #: ``Point2f``, attached: first end point
     b: object       #: ``Point2f``, attached: second end point
 
-    def __len__(self) -> int:
-        return dr.width(self.a)
-
 
 def silhouette_mask(positions, faces, table, viewpoint):
     """Which directed edges carry the silhouette seen from a point.
