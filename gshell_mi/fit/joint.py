@@ -36,7 +36,7 @@ class JointStage:
         self._targets = [mi.TensorXf(target.rgba) for target in fit.targets]
         self._has_alpha = all(target.has_alpha for target in fit.targets)
         self._integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
-                                         "hide_emitters": True})
+                                         "reparam_depth": config.reparam_depth, "hide_emitters": True})
         self._diffuse = LatticeDiffusion(self.subject.lattice.stride)
         # One step size for the whole surface: normalising each vertex on its own would undo the smoothing
         # and let noise move the vertices that few pixels see as far as all others.
