@@ -9,7 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from bowl import SHORT, SIZE
+from bowl import CLOSED, SHORT, SIZE
 
 from gshell_mi.fit.__main__ import main
 
@@ -285,8 +285,7 @@ def test_disk_full_at_export(told, scene, tmp_path, monkeypatch, writer):
     output = tmp_path / "out"
     with monkeypatch.context() as patch:
         patch.setattr(f"gshell_mi.export.{writer}", _full)
-        assert "No space left on device" in told("--iterations", "1", whole=True)
+        assert "No space left on device" in told(*CLOSED, "--iterations", "1", whole=True)
     assert not (output / "metrics.json").exists()
-    assert main([str(scene), "-o", str(output), *SHORT, "--iterations", "1",
-                 "--resume"]) == 0
+    assert main([str(scene), "-o", str(output), *SHORT, *CLOSED, "--iterations", "1", "--resume"]) == 0
     assert (output / "metrics.json").is_file()
