@@ -124,8 +124,9 @@ def write_page(rows, images, resolution, quick):
         mi.Bitmap((255 * strip.repeat(2, 0).repeat(2, 1)).astype(np.uint8)).write(
             str(folder / f"gradients_{name}.png"))
     lines = [HEADER, f"{resolution}² pixels; Mitsuba {mi.__version__}, `{mi.variant()}`"
-             f"{', quick settings' if quick else ''}.\n\n",
-             "| scene | depth | FD | gshell_path, 128 spp | bias | right | 4 spp | corr. | fwd - rev "
+             f"{', --quick' if quick else ''}. "
+             "Rows without figures of the projective integrators were run with --ours.\n\n",
+             f"| scene | depth | FD | gshell_path, {32 if quick else 128} spp | bias | right | 4 spp | corr. | fwd - rev "
              "| prb_projective | direct_projective |\n", "|---|---|---|---|---|---|---|---|---|---|---|\n"]
     lines += [format_row(row) + "\n" for row in rows]
     lines.append(f"\n{sum(map(passes, rows))} of {len(rows)} scenes are right.\n\n## Gradient images\n\n"
