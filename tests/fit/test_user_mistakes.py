@@ -213,6 +213,11 @@ def test_output_without_permission(told, tmp_path):
     assert "no permission" in told(output=tmp_path / "locked" / "out")
 
 
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder that nobody may write")
+def test_output_that_not_even_root_may_write(told):
+    assert "'/proc/self/out' cannot be written" in told(output=Path("/proc/self/out"), whole=True)
+
+
 def test_earlier_fit_is_kept(told, tmp_path):
     output = tmp_path / "out"
     output.mkdir()
