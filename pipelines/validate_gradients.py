@@ -126,8 +126,8 @@ def write_page(rows, images, resolution, quick):
     lines = [HEADER, f"{resolution}² pixels; Mitsuba {mi.__version__}, `{mi.variant()}`"
              f"{', --quick' if quick else ''}. "
              "Rows without figures of the projective integrators were run with --ours.\n\n",
-             f"| scene | depth | FD | gshell_path, {32 if quick else 128} spp | bias | right | 4 spp | corr. | fwd - rev "
-             "| prb_projective | direct_projective |\n", "|---|---|---|---|---|---|---|---|---|---|---|\n"]
+             f"| scene | depth | FD | gshell_path, {32 if quick else 128} spp | bias | right | 4 spp "
+             "| corr. | fwd - rev | prb_projective | direct_projective |\n", "|---|---|---|---|---|---|---|---|---|---|---|\n"]
     lines += [format_row(row) + "\n" for row in rows]
     lines.append(f"\n{sum(map(passes, rows))} of {len(rows)} scenes are right.\n\n## Gradient images\n\n"
                  "Finite differences, `gshell_path`, difference; red positive, blue negative.\n\n")
