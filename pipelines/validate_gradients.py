@@ -127,7 +127,8 @@ def write_page(rows, images, resolution, quick):
              f"{', --quick' if quick else ''}. "
              "Rows without figures of the projective integrators were run with --ours.\n\n",
              f"| scene | depth | FD | gshell_path, {32 if quick else 128} spp | bias | right | 4 spp "
-             "| corr. | fwd - rev | prb_projective | direct_projective |\n", "|---|---|---|---|---|---|---|---|---|---|---|\n"]
+             "| corr. | fwd - rev | prb_projective | direct_projective |\n",
+             "|---|---|---|---|---|---|---|---|---|---|---|\n"]
     lines += [format_row(row) + "\n" for row in rows]
     lines.append(f"\n{sum(map(passes, rows))} of {len(rows)} scenes are right.\n\n## Gradient images\n\n"
                  "Finite differences, `gshell_path`, difference; red positive, blue negative.\n\n")
