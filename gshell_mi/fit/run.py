@@ -25,6 +25,7 @@ from ..scene import load_fit_scene
 from ..views import PinholeViews
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
 from .config import FitConfig, default_output
+from .interrupt import Interrupt
 from .joint import JointStage
 from .opening import clean_opacity, close_unjustified, msdf_from_template, splat_to_lattice
 from .pixels import PixelPool
@@ -72,14 +73,15 @@ def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: s
     config = config or FitConfig()
     scene = Path(scene)
     output = Path(output) if output else default_output(scene)
-    with Progress(quiet=quiet) as progress:
-        return _Fit(scene, output, targets, config, resume, overwrite, progress).run()
+    with Interrupt() as interrupt, Progress(quiet=quiet) as progress:
+        return _Fit(scene, output, targets, config, resume, overwrite, progress, interrupt).run()
 
 
 class _Fit:
     def __init__(self, scene: Path, output: Path, targets: str | Path | None, config: FitConfig, resume: bool,
-                 overwrite: bool, progress: Progress):
-        self.config, self.progress, self.output = config, progress, output
+                 overwrite: bool, progress: Progress, interrupt: Interrupt):
+        self.config, self.output = config, output
+        self.progress, self.interrupt = progress, interrupt
         self.path = output / "checkpoint.npz"
         self.checkpoint = Checkpoint("hull", 0, _plain(config))
         if resume:
@@ -104,6 +106,7 @@ class _Fit:
             if self.checkpoint.stage == "ghost":
                 self._ghost()
             joint = self._joint()
+            self.interrupt.check()
             with self.progress.stage("export", None), self._timed("export"):
                 metrics = export_fit(self.output, self.scene, joint, self.config, self.checkpoint.seconds)
         except OSError as error:
@@ -224,6 +227,7 @@ class _Fit:
             saved = time.monotonic()
             for iteration in range(first, count):
                 begin = time.monotonic()
+                self.interrupt.check()
                 values = step(iteration)
                 values = {name: float(value) for name, value in values.items()}
                 self._write_log(stage, iteration, values, time.monotonic() - begin)
