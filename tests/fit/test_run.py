@@ -203,4 +203,4 @@ def test_killed_and_resumed(bowl_scene, whole, tmp_path, record_property):
     record_property("distance of two whole runs", between_whole_runs)
     record_property("distance of a whole and a killed run", to_killed)
     # Sums over threads depend on their order, and rounding grows from step to step.
-    assert to_killed <= 2 * between_whole_runs + 1e-3
+    assert to_killed <= 2 * between_whole_runs + 2e-4
