@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .extraction.surface_mesh import gather
+
 
 def tonemap(radiance):
     """Logarithmic tone curve ``log(1 + x)``: bright pixels stop dominating; 0 stays 0."""
@@ -47,7 +49,7 @@ def chroma_difference(first: mi.Color3f, second: mi.Color3f) -> mi.Float:
 
 def edge_smoothness(values: mi.Color3f | mi.Float, faces: mi.Vector3u) -> mi.Float:
     """Mean absolute difference of vertex values along the faces' edges."""
-    corners = [dr.gather(type(values), values, faces[i]) for i in range(3)]
+    corners = [gather(type(values), values, faces[i]) for i in range(3)]
     return sum(_mean(dr.abs(corners[i] - corners[i - 1])) for i in range(3)) / 3
 
 
