@@ -1,0 +1,90 @@
+"""``python -m gshell_mi.capture SRC -o SCENE.xml``: photographs with known cameras to a fit scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+
+from ..doctor import ensure_variant
+from ..errors import UserError
+from .config import CaptureConfig
+
+
+@dataclass(frozen=True)
+class _Arguments:
+    source: tyro.conf.Positional[Path]
+    """The capture: a folder with transforms*.json (NeRF), cameras*.npz (IDR, NeuS), sparse/0 (COLMAP),
+    poses_bounds.npy (LLFF) or an XML file of Mitsuba sensors; or that file. With --check but no output: a fit
+    scene."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """The fit scene to write, ending in .xml; the targets go into the folder of its name beside it."""
+    check: bool = False
+    """Draw check.png into the scene's folder: cameras, box, axes and visual hull over every view."""
+    overwrite: bool = False
+    """Replace what an earlier import wrote."""
+    variant: str = "llvm_ad_rgb"
+    """Mitsuba variant: llvm_ad_rgb (CPU) or cuda_ad_rgb (NVIDIA GPU)."""
+    quiet: bool = False
+    """No progress bar."""
+    config: Annotated[CaptureConfig, tyro.conf.arg(name="")] = dataclasses.field(
+        default_factory=CaptureConfig)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    try:
+        given = tyro.cli(_Arguments, args=arguments, prog="python -m gshell_mi.capture",
+                         description="Turn photographs with known cameras into a scene for gshell_mi.fit.",
+                         config=(tyro.conf.FlagCreatePairsOff,))
+        ensure_variant(given.variant)
+        if given.output is None and not given.check:
+            raise UserError("Nothing to do: give the scene to write with -o, or --check for a look at one.")
+        if given.output is not None:
+            _import(given)
+        if given.check:
+            _check(given.output or given.source, warn=given.output is None)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("Interrupted; nothing was written.", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _import(given: _Arguments) -> None:
+    from .run import import_capture
+
+    with Progress(console=Console(stderr=True), transient=True, disable=given.quiet) as bar:
+        task = bar.add_task("photographs", total=None)
+        result = import_capture(given.source, given.output, config=given.config, overwrite=given.overwrite,
+                                progress=lambda done, count: bar.update(task, completed=done, total=count))
+    _warn(result.warnings)
+    low, high = (", ".join(f"{value:.3g}" for value in corner) for corner in result.box)
+    print(f"{result.path}: {result.training} training views, {result.held_out} held out, box ({low}) to "
+          f"({high})")
+
+
+def _check(scene: Path, *, warn: bool) -> None:
+    from .check import check_scene
+
+    report = check_scene(scene)
+    if warn:    # an import has said the same already
+        _warn(report.warnings)
+    print(f"{report.picture}: look at it before the fit")
+
+
+def _warn(warnings: tuple[str, ...]) -> None:
+    for warning in warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,192 @@
+"""Image files to linear Rec.709."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from PIL import ExifTags, Image
+from skimage.io import imread
+
+from ..errors import UserError
+
+#: Formats that hold floating point values, linear unless told otherwise, colour premultiplied by alpha.
+FLOAT_SUFFIXES = (".exr", ".hdr", ".pfm")
+#: In the order in which they are tried for a name without a suffix.
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".tga", ".hdr", ".pfm")
+
+_REC709 = "ITU-R BT.709"
+
+
+def is_image(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+
+
+def images_in(folder: Path) -> list[Path]:
+    """The image files in a folder by name; without those in its sub-folders."""
+    return sorted(path for path in folder.iterdir() if is_image(path)) if folder.is_dir() else []
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) of an image file.
+
+    Raises:
+        UserError: it is missing or cannot be read.
+    """
+    if not path.is_file():
+        raise UserError(f"Image '{path}' is missing; the capture names it, so put it there.")
+    try:
+        if path.suffix.lower() in FLOAT_SUFFIXES:
+            return tuple(mi.Bitmap(str(path)).size())
+        with Image.open(path) as image:
+            return image.size
+    except Exception as error:
+        raise _unreadable(path, error) from error
+
+
+def read_pixels(path: Path) -> np.ndarray:
+    """The pixels as the file stores them: (height, width, 3 or 4) of uint8, uint16 or float32.
+
+    Grey is repeated to RGB; palettes are resolved.
+
+    Raises:
+        UserError: the file is missing, cut off or of an unknown kind, or holds NaN or infinity.
+    """
+    if not path.is_file():
+        raise UserError(f"Image '{path}' is missing; the capture names it, so put it there.")
+    try:
+        pixels = _read(path)
+    except Exception as error:
+        raise _unreadable(path, error) from error
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    if pixels.ndim != 3 or pixels.shape[2] > 4 or pixels.dtype.kind not in "uf":
+        raise UserError(f"Image '{path}' has the layout {pixels.shape} of {pixels.dtype}; write it as a "
+                        f"grey, RGB or RGBA image of 8, 16 or floating point bits.")
+    if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
+        row, column = np.argwhere(~np.isfinite(pixels).all(axis=-1))[0]
+        raise UserError(f"Image '{path}' holds NaN or infinity (first at column {column}, row {row}); mend "
+                        f"those pixels.")
+    grey, alpha = pixels[..., :1], pixels[..., 1:]
+    if pixels.shape[2] <= 2:
+        pixels = np.concatenate([grey, grey, grey, alpha], axis=-1)
+    return pixels
+
+
+def _read(path: Path) -> np.ndarray:
+    suffix = path.suffix.lower()
+    if suffix in FLOAT_SUFFIXES:
+        bitmap = mi.Bitmap(str(path))
+        if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+            bitmap = dict(bitmap.split())["<root>"]    # the unnamed layer, beside depth, normals and so on
+        return np.array(bitmap.convert(component_format=mi.Struct.Type.Float32))
+    if suffix in (".tif", ".tiff"):
+        return imread(path)
+    with Image.open(path) as image:
+        image.load()    # complains of files that are cut off, unlike libpng through Mitsuba
+        if _is_deep_png(path):
+            return np.array(mi.Bitmap(str(path)))
+        if image.mode in ("P", "PA"):
+            image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
+        elif image.mode not in ("L", "LA", "RGB", "RGBA"):
+            image = image.convert("RGB")
+        return np.array(image)
+
+
+def _is_deep_png(path: Path) -> bool:
+    """Pillow hands out 8 of 16 bits."""
+    with open(path, "rb") as file:
+        header = file.read(25)
+    return header[1:4] == b"PNG" and header[24] == 16
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return UserError(f"Image '{path}' cannot be read ({lines[-1]}); copy or export it again.")
+
+
+@dataclass(frozen=True)
+class ColorDecoding:
+    """How pixel values become linear Rec.709.
+
+    Attributes:
+        color_space: an RGB colour space that colour-science knows: "sRGB", "Display P3", "ACEScg" ...
+            Its primaries and, for integer files, its transfer function count.
+        transfer: transfer function by its name in colour-science ("ITU-R BT.709", "Gamma 2.2", "S-Log3"
+            ...) or "linear"; default: that of the colour space for integer files, linear for
+            floating point files.
+
+    Raises:
+        UserError: a name is unknown.
+
+    >>> ColorDecoding().linear(np.full((1, 1, 3), 188, np.uint8))[0, 0].round(3)
+    array([0.503, 0.503, 0.503], dtype=float32)
+    """
+
+    color_space: str = "sRGB"
+    transfer: str | None = None
+
+    def __post_init__(self):
+        import colour
+
+        _known(self.color_space, colour.RGB_COLOURSPACES, "--color-space", "colour space")
+        if self.transfer not in (None, "linear"):
+            _known(self.transfer, colour.CCTF_DECODINGS, "--transfer", "transfer function")
+
+    def linear(self, rgb: np.ndarray) -> np.ndarray:
+        """(h, w, 3) of uint8, uint16 or float to float32 >= 0; integers reach 1 at their largest value."""
+        if rgb.dtype.kind == "u":
+            # A table has as many entries as there are values, so that slow functions cost nothing.
+            levels = np.linspace(0.0, 1.0, np.iinfo(rgb.dtype).max + 1)
+            linear = self._decode(levels, integer=True).astype(np.float32)[rgb]
+        else:
+            linear = self._decode(rgb, integer=False).astype(np.float32)
+        if self._to_rec709 is not None:
+            linear = linear @ self._to_rec709
+        return np.maximum(linear, 0.0)
+
+    def _decode(self, values: np.ndarray, *, integer: bool) -> np.ndarray:
+        import colour
+
+        if self.transfer == "linear" or (self.transfer is None and not integer):
+            return values
+        if self.transfer is None:
+            return colour.RGB_COLOURSPACES[self.color_space].cctf_decoding(values)
+        return colour.cctf_decoding(values, self.transfer)
+
+    @cached_property
+    def _to_rec709(self) -> np.ndarray | None:
+        """Of row vectors."""
+        import colour
+
+        matrix = colour.matrix_RGB_to_RGB(colour.RGB_COLOURSPACES[self.color_space],
+                                          colour.RGB_COLOURSPACES[_REC709])
+        return None if np.allclose(matrix, np.eye(3), atol=1e-3) else matrix.T.astype(np.float32)
+
+
+def _known(name: str, names: object, option: str, what: str) -> None:
+    if name not in names:
+        near = difflib.get_close_matches(name, list(names), n=1, cutoff=0.3) or sorted(names)[:1]
+        raise UserError(f"{option} '{name}' is no {what} that colour-science knows; did you mean "
+                        f"'{near[0]}'?")
+
+
+def exif_exposure(path: Path) -> float | None:
+    """Exposure of a photograph in stops above 1 s at f/1 and ISO 100; None if its EXIF data do not tell."""
+    if path.suffix.lower() in FLOAT_SUFFIXES:
+        return None
+    with Image.open(path) as image:
+        tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    try:
+        seconds = float(tags[ExifTags.Base.ExposureTime])
+        aperture = float(tags[ExifTags.Base.FNumber])
+        sensitivity = tags[ExifTags.Base.ISOSpeedRatings]
+        iso = float(sensitivity[0] if isinstance(sensitivity, tuple) else sensitivity)
+        exposure = float(np.log2(seconds * iso / 100 / aperture**2))
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    return exposure if np.isfinite(exposure) else None

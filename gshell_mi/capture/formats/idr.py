@@ -1,0 +1,89 @@
+"""IDR's and NeuS's ``cameras*.npz``: DTU, BlendedMVS and what follows them.
+
+``world_mat_i`` is a projection ``K [R | t]`` from the world to pixels with integer centres (0, 0), and
+``scale_mat_i`` maps the unit sphere, which holds the object, to the world.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import rq
+
+from ...errors import UserError
+from ..camera import Camera
+from ..decoding import image_size, images_in
+from ..frames import Capture, Frame, pose_of
+
+_NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
+_FOLDERS = ("image", "images", "rgb")
+
+
+def find(source: Path) -> Path | None:
+    """The npz file: the given one, or that in the folder."""
+    if source.is_file():
+        return source if source.suffix == ".npz" else None
+    named = [source / name for name in _NAMES if (source / name).is_file()]
+    return next(iter(named or sorted(source.glob("cameras*.npz"))), None)
+
+
+def read(source: Path, images: Path | None = None) -> Capture:
+    """Reads ``cameras*.npz`` and the images in ``image/`` (or ``images/``, ``rgb/``) in the order of names.
+
+    Raises:
+        UserError: the file is malformed, or the numbers of cameras and images differ.
+    """
+    path = find(source)
+    root = source if source.is_dir() else source.parent
+    folder = images or next((root / name for name in _FOLDERS if (root / name).is_dir()), None)
+    if folder is None:
+        raise UserError(f"'{path}' has no folder 'image' beside it; name it with --images.")
+    files = images_in(folder)
+    try:
+        with np.load(path) as stored:
+            arrays = {key: np.array(stored[key], dtype=np.float64) for key in stored.files
+                      if key.startswith(("world_mat_", "scale_mat_")) and "_inv" not in key}
+    except Exception as error:
+        raise UserError(f"'{path}' cannot be read ({error}); copy or export it again.") from error
+    count = sum(key.startswith("world_mat_") for key in arrays)
+    if count == 0:
+        raise UserError(f"'{path}' has no world_mat_0, so it holds no IDR or NeuS cameras; give another "
+                        "file.")
+    if count != len(files):
+        raise UserError(f"'{path}' has {count} cameras, but '{folder}' has {len(files)} images; remove or "
+                        f"add what does not belong.")
+    frames, regions = [], []
+    for index, image in enumerate(files):
+        owner = f"camera {index} of '{path}'"
+        world = arrays.get(f"world_mat_{index}", np.zeros(0))
+        frames.append(Frame(image, _camera(world, image, owner)))
+        scale = arrays.get(f"scale_mat_{index}")
+        if scale is not None and scale.shape == (4, 4) and np.isfinite(scale).all():
+            radius = np.linalg.norm(scale[:3, :3], axis=1)
+            regions.append([scale[:3, 3] - radius, scale[:3, 3] + radius])
+    region = np.mean(regions, axis=0) if regions else None
+    return Capture("IDR / NeuS", source, tuple(frames), region=region)
+
+
+def _camera(matrix: np.ndarray, image: Path, owner: str) -> Camera:
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+        raise UserError(f"The world_mat of {owner} is no finite 4 x 4 matrix; export the cameras again.")
+    projection = matrix[:3]
+    # A projection means the same with the opposite sign; depth is to grow forwards.
+    projection = projection * np.sign(np.linalg.det(projection[:, :3]) or 1.0)
+    intrinsic, rotation = rq(projection[:, :3])
+    if abs(intrinsic[2, 2]) < 1e-12 or np.abs(np.diag(intrinsic)).min() < 1e-12:
+        raise UserError(f"The world_mat of {owner} is singular; export the cameras again.")
+    signs = np.diag(np.sign(np.diag(intrinsic)))
+    intrinsic, rotation = intrinsic @ signs, signs @ rotation
+    center = -np.linalg.solve(projection[:, :3], projection[:, 3])
+    intrinsic /= intrinsic[2, 2]
+    if abs(intrinsic[0, 1]) > 1e-3 * intrinsic[0, 0]:
+        raise UserError(f"The world_mat of {owner} has skewed pixels, which are not supported; resample its "
+                        f"image.")
+    pose = pose_of(np.concatenate([rotation.T, center[:, None]], axis=1), owner)
+    width, height = image_size(image)
+    # Half a pixel: from integer centres to corners at integers.
+    return Camera(width, height, intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2] + 0.5,
+                  intrinsic[1, 2] + 0.5, pose)

@@ -1,0 +1,151 @@
+"""Where the object is in each photograph: from alpha, from mask images or from a background colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import ImageColor
+
+from ..errors import UserError
+from .decoding import SUFFIXES, images_in, read_pixels
+from .frames import Capture, Frame
+
+#: Folders that data sets keep masks in, beside the images' folder or in the capture's.
+_FOLDERS = ("masks", "mask")
+
+_SUPPLY = ("supply images with alpha, a folder of masks (white on the object) as 'masks' beside the images "
+           "or with --masks, or the colour behind the object with --background")
+
+
+@dataclass(frozen=True)
+class Background:
+    """A known, even colour behind the object.
+
+    Attributes:
+        color: encoded RGB as in the images, in [0, 1].
+        tolerance: distance, in units of the encoded range, at which a pixel is wholly the object's;
+            coverage rises linearly up to there.
+    """
+
+    color: tuple[float, float, float]
+    tolerance: float = 0.1
+
+    @classmethod
+    def parse(cls, text: str, tolerance: float = 0.1) -> Background:
+        """From "white", "#00ff00" or any other colour name of CSS.
+
+        Raises:
+            UserError: it is none, or the tolerance is not positive.
+
+        >>> Background.parse("#00ff00").color
+        (0.0, 1.0, 0.0)
+        """
+        try:
+            color = ImageColor.getrgb(text)[:3]
+        except ValueError:
+            raise UserError(f"--background '{text}' is no colour; give one as white, black or "
+                            f"'#00ff00'.") from None
+        if not tolerance > 0:
+            raise UserError(f"--background-tolerance must be positive, and is {tolerance:g}.")
+        return cls(tuple(value / 255 for value in color), tolerance)
+
+    def coverage(self, encoded: np.ndarray) -> np.ndarray:
+        """(h, w) from (h, w, 3) encoded values in [0, 1]."""
+        return np.clip(np.abs(encoded - np.array(self.color)).max(axis=-1) / self.tolerance, 0.0, 1.0)
+
+
+def assign_masks(capture: Capture, folder: Path | None) -> Capture:
+    """Finds the mask file of each frame.
+
+    Masks are matched to images by name (``IMG_1.png`` or ``IMG_1.jpg.png`` for ``IMG_1.jpg``, sub-folders
+    alike), or all by their order if no name matches and there are as many.
+
+    Args:
+        folder: where they are; default: ``masks`` or ``mask`` if there is one, unless the format names
+            each frame's.
+
+    Raises:
+        UserError: the folder does not exist, or it lacks the mask of an image.
+    """
+    if folder is None:
+        if any(frame.mask for frame in capture.frames):
+            missing = next((frame for frame in capture.frames if not frame.mask), None)
+            if missing:
+                raise UserError(f"The capture names masks, but none for '{missing.image}'; add it, or give "
+                                f"a folder of masks with --masks.")
+            return capture
+        folder = _beside(capture)
+        if folder is None:
+            return capture
+    elif not folder.is_dir():
+        raise UserError(f"Mask folder '{folder}' does not exist; correct --masks.")
+    found = [_match(folder, frame.image) for frame in capture.frames]
+    if not any(found):
+        inside = images_in(folder)
+        if len(inside) != len(capture.frames):
+            raise UserError(f"The masks in '{folder}' have neither the images' names nor their number "
+                            f"({len(inside)} masks, {len(capture.frames)} images); name each as its image.")
+        found = inside
+    for mask, frame in zip(found, capture.frames, strict=True):
+        if mask is None:
+            raise UserError(f"Image '{frame.image}' has no mask in '{folder}'; add "
+                            f"'{frame.image.stem}.png' there.")
+    frames = tuple(replace(frame, mask=mask) for frame, mask in zip(capture.frames, found, strict=True))
+    return replace(capture, frames=frames)
+
+
+def _beside(capture: Capture) -> Path | None:
+    root = capture.source if capture.source.is_dir() else capture.source.parent
+    image = capture.frames[0].image
+    for parent in (image.parent.parent, root):
+        for name in _FOLDERS:
+            if (parent / name).is_dir():
+                return parent / name
+    return None
+
+
+def _match(folder: Path, image: Path) -> Path | None:
+    # An image in a sub-folder of images/ may have its mask in the same sub-folder of masks/.
+    for inside in (folder, folder / image.parent.name):
+        for name in (image.name, image.name + ".png", *(image.stem + suffix for suffix in SUFFIXES)):
+            if (inside / name).is_file():
+                return inside / name
+    return None
+
+
+def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None) -> np.ndarray:
+    """(h, w) coverage in [0, 1] of a frame with the given stored pixels.
+
+    A given background colour comes first, then the frame's mask, then alpha.
+
+    Raises:
+        UserError: there is none of them, or the mask has another size than the image.
+    """
+    if background is not None:
+        return background.coverage(_unit(pixels[..., :3])).astype(np.float32)
+    if frame.mask is not None:
+        mask = read_pixels(frame.mask)
+        if mask.shape[:2] != pixels.shape[:2]:
+            raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "
+                            f"is {pixels.shape[1]} x {pixels.shape[0]}; resize it.")
+        values = _unit(mask)
+        # Some tools put the mask into alpha and leave the colour empty or as it was.
+        if values.shape[2] == 4 and values[..., 3].min() < 1:
+            return np.clip(values[..., 3], 0, 1)
+        return np.clip(values[..., :3].mean(axis=-1), 0, 1)
+    if pixels.shape[2] < 4:
+        raise UserError(f"Image '{frame.image}' has no alpha, and there is no mask for it; {_SUPPLY}.")
+    alpha = np.clip(_unit(pixels[..., 3]), 0, 1)
+    if (alpha == 1).all():
+        raise UserError(f"Image '{frame.image}' has an alpha of 1 everywhere, and there is no mask for it; "
+                        f"{_SUPPLY}.")
+    return alpha
+
+
+def _unit(values: np.ndarray) -> np.ndarray:
+    """Integers scaled to [0, 1]; float32."""
+    if values.dtype.kind == "u":
+        return values.astype(np.float32) / np.iinfo(values.dtype).max
+    return values.astype(np.float32)

@@ -1,0 +1,109 @@
+"""From one photograph to one target: linear, masked, shrunk, undistorted."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UserError
+from .camera import Camera
+from .decoding import FLOAT_SUFFIXES, ColorDecoding, exif_exposure, read_pixels
+from .frames import Capture, Frame
+from .masks import Background, coverage_of
+from .resample import rectify, shrink
+
+#: Half floats end at 65504; a target there is far beyond what a photograph holds.
+_BRIGHTEST = 6e4
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What is done to every photograph.
+
+    Attributes:
+        decoding: from stored values to linear Rec.709.
+        background: the colour behind the object, if that is to make the masks.
+        max_size: longest side of a target in pixels; 0 keeps the images' size.
+        gains: factor on a file's linear values that evens out its exposure; 1 where not named.
+    """
+
+    decoding: ColorDecoding = field(default_factory=ColorDecoding)
+    background: Background | None = None
+    max_size: int = 0
+    gains: dict[Path, float] = field(default_factory=dict)
+
+    def target(self, frame: Frame) -> tuple[np.ndarray, Camera]:
+        """The target image of a frame and its pinhole camera.
+
+        Returns:
+            (height, width, 4) float32, linear Rec.709, premultiplied by alpha = coverage; and the camera
+            with square pixels and without distortion that sees it.
+
+        Raises:
+            UserError: the image or its mask cannot be used.
+        """
+        pixels = read_pixels(frame.image)
+        coverage = coverage_of(frame, pixels, self.background)[..., None]
+        linear = self.decoding.linear(pixels[..., :3])
+        if self.background is not None:
+            behind = self._encoded(self.background.color, pixels.dtype)
+            rgb = np.maximum(linear - (1 - coverage) * self.decoding.linear(behind), 0)
+        elif _is_premultiplied(frame, pixels):
+            rgb = linear
+        else:
+            rgb = linear * coverage
+        rgb = np.minimum(rgb * self.gains.get(frame.image, 1.0), _BRIGHTEST)
+        image = np.concatenate([rgb, coverage], axis=-1).astype(np.float32)
+        # The lens formula is in units of the focal length, so it holds for the small image, at less cost.
+        return rectify(*shrink(image, frame.camera, self.max_size))
+
+    @staticmethod
+    def _encoded(color: tuple[float, float, float], dtype: np.dtype) -> np.ndarray:
+        value = np.array(color).reshape(1, 1, 3)
+        return np.round(value * np.iinfo(dtype).max).astype(dtype) if dtype.kind == "u" else value
+
+
+def _is_premultiplied(frame: Frame, pixels: np.ndarray) -> bool:
+    """OpenEXR's colour is premultiplied by its own alpha, PNG's is not; a mask file cuts out anew."""
+    return frame.mask is None and pixels.shape[2] == 4 and frame.image.suffix.lower() in FLOAT_SUFFIXES
+
+
+def exposure_gains(capture: Capture, file: Path | None, *, exif: bool = True) -> dict[Path, float]:
+    """Factors that bring all photographs to their mean exposure (in stops).
+
+    Args:
+        file: a JSON object of exposures in stops, larger is brighter, by the images' file names.
+        exif: without a file, take shutter time, aperture and ISO from EXIF data if all photographs
+            have them.
+
+    Raises:
+        UserError: the file is malformed, or lacks an image.
+    """
+    images = [frame.image for frame in capture.frames]
+    if file is not None:
+        stops = _stops_from_file(file, images)
+    elif exif:
+        stops = [exif_exposure(image) for image in images]
+    else:
+        return {}
+    if any(value is None for value in stops) or np.ptp(stops) < 1e-3:
+        return {}
+    mean = float(np.mean(stops))
+    return {image: 2.0 ** (mean - value) for image, value in zip(images, stops, strict=True)}
+
+
+def _stops_from_file(file: Path, images: list[Path]) -> list[float]:
+    try:
+        table = json.loads(file.read_text(encoding="utf-8-sig"))
+        table = {str(name): float(value) for name, value in table.items()}
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"--exposures '{file}' is no JSON object of stops by file name ({error}); write "
+                        f"{{\"IMG_1.jpg\": 0.0, \"IMG_2.jpg\": -1.5}}.") from error
+    for image in images:
+        if not math.isfinite(table.get(image.name, math.nan)):
+            raise UserError(f"--exposures '{file}' has no finite exposure for '{image.name}'; add it.")
+    return [table[image.name] for image in images]

@@ -1,0 +1,215 @@
+"""From a capture to a fit scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UserError
+from .camera import Camera
+from .config import AXES, CaptureConfig
+from .decoding import ColorDecoding
+from .formats import read_capture
+from .frames import Capture, Frame
+from .masks import Background, assign_masks
+from .prepare import Preparation, exposure_gains
+from .region import find_box, likely_misreading
+from .trouble import Thumbnail, find_trouble
+from .writer import scene_xml, sensors_xml, staged, write_record, write_target
+
+
+@dataclass(frozen=True)
+class CaptureResult:
+    """What an import wrote.
+
+    Attributes:
+        path: the fit scene.
+        training, held_out: numbers of views.
+        box: (2, 3) corners of the lattice's cube, in the scene.
+        warnings: what is likely wrong, a sentence each.
+    """
+
+    path: Path
+    training: int
+    held_out: int
+    box: np.ndarray
+    warnings: tuple[str, ...]
+
+
+def import_capture(source: str | Path, output: str | Path, *, config: CaptureConfig | None = None,
+                   overwrite: bool = False,
+                   progress: Callable[[int, int], None] | None = None) -> CaptureResult:
+    """Turns photographs with known cameras into a fit scene.
+
+    A Mitsuba ``llvm`` or ``cuda`` variant must be set. Writes ``output`` (an XML file) and beside it the
+    folder of its stem: targets ``view_000.exr`` and so on, ``sensors.xml``, ``capture.json`` (which view is
+    which photograph, how the world was turned) and, if there are held-out views, ``test.xml`` with
+    ``test/test_000.exr`` and so on. Either all of that or, on an error, nothing.
+
+    Args:
+        source: the capture's folder or main file.
+        output: the fit scene to write.
+        config: see ``CaptureConfig``.
+        overwrite: replace what an earlier import wrote.
+        progress: called with (photographs done, photographs).
+
+    Raises:
+        UserError: of anything in the capture or the options that the user can mend.
+    """
+    config = config or CaptureConfig()
+    source, output = Path(source), Path(output)
+    with staged(output, overwrite=overwrite, source=source) as partial:
+        return _Import(source, output, config, progress).write(partial)
+
+
+class _Import:
+    def __init__(self, source: Path, output: Path, config: CaptureConfig,
+                 progress: Callable[[int, int], None] | None):
+        self.config, self.output, self.progress = config, output, progress
+        decoding = ColorDecoding(config.color_space, config.transfer)
+        background = None
+        if config.background is not None:
+            background = Background.parse(config.background, config.background_tolerance)
+        capture = read_capture(source, format=config.format, images=config.images,
+                               opencv_axes=config.opencv_axes)
+        if background is None:
+            capture = assign_masks(capture, config.masks)
+        if config.hold_out:
+            capture = capture.holding_out(config.hold_out)
+        if not capture.training:
+            raise UserError(f"'{source}' has no training views; all are held out.")
+        self.to_scene = to_scene(capture, config.up)
+        self.capture = replace(capture, frames=tuple(
+            replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames))
+        gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
+        self.preparation = Preparation(decoding, background, config.max_size, gains)
+        self.warnings: list[str] = []
+
+    def write(self, partial: Path) -> CaptureResult:
+        folder = partial / self.output.stem
+        cameras: dict[str, Camera] = {}
+        tests: dict[str, Camera] = {}
+        thumbnails, views, empty = [], [], []
+        for index, frame in enumerate(self.capture.frames):
+            rgba, camera = self.preparation.target(frame)
+            if not frame.held_out and not (rgba[..., 3] >= 0.5).any():
+                empty.append(frame.image.name)    # it would carve away everything that it frames
+                continue
+            kind, group = ("test", tests) if frame.held_out else ("view", cameras)
+            name = f"{kind}_{len(group):03}"
+            place = folder / "test" if frame.held_out else folder
+            place.mkdir(exist_ok=True)
+            write_target(place / f"{name}.exr", rgba)
+            group[name] = camera
+            if not frame.held_out:
+                thumbnails.append(Thumbnail.of(f"{name} ({frame.image.name})", rgba, camera))
+            views.append(self._view_record(name, frame))
+            if self.progress:
+                self.progress(index + 1, len(self.capture.frames))
+        if not cameras:
+            raise UserError(f"The masks of all images of '{self.capture.source}' are empty; masks are white, "
+                            f"and alpha is 1, on the object.")
+        if empty:
+            self.warnings.append(f"{len(empty)} views with empty masks are left out: {', '.join(empty[:3])}"
+                                 f"{' ...' if len(empty) > 3 else ''}.")
+        box = self._box(thumbnails)
+        self.warnings += find_trouble(thumbnails, box)
+        (folder / "sensors.xml").write_text(sensors_xml(cameras, box), encoding="utf-8")
+        if tests:
+            (folder / "test.xml").write_text(sensors_xml(tests, box), encoding="utf-8")
+        light = self._copy_light(folder)
+        (partial / self.output.name).write_text(
+            scene_xml(self.output.stem, box, self.config.resolution, light), encoding="utf-8")
+        write_record(folder, self._record(views, box))
+        return CaptureResult(self.output, len(cameras), len(tests), box, tuple(self.warnings))
+
+    def _box(self, thumbnails: list[Thumbnail]) -> np.ndarray:
+        if self.config.box is not None:
+            low, high = np.array(self.config.box).reshape(2, 3)
+            half = (high - low).max() / 2
+            return np.stack([(low + high) / 2 - half, (low + high) / 2 + half])
+        silhouettes = [thumbnail.silhouette for thumbnail in thumbnails]
+        region = self.capture.region
+        if region is not None:
+            center = self.to_scene[:3, :3] @ region.mean(axis=0)
+            region = np.stack([center - np.ptp(region, axis=0).max() / 2,
+                               center + np.ptp(region, axis=0).max() / 2])
+        box = find_box(silhouettes, region)
+        if box is None:
+            misreading = likely_misreading(silhouettes)
+            if misreading and "OpenCV" in misreading:
+                other = "leave out" if self.config.opencv_axes else "try"
+                cure = f"the cameras look misread, as the masks agree if {misreading}: {other} --opencv-axes"
+            elif misreading:
+                cure = f"the cameras look misread, as the masks agree if {misreading}: export them again"
+            else:
+                cure = "check the masks and cameras, or give --box and look at the picture of --check"
+            raise UserError(f"The masks of '{self.capture.source}' have no common volume; {cure}.")
+        return box
+
+    def _copy_light(self, folder: Path) -> str | None:
+        """The name of the copy, relative to the XML file."""
+        if self.config.light is None:
+            return None
+        try:
+            mi.Bitmap(str(self.config.light))
+        except Exception as error:
+            reason = (str(error).strip().splitlines() or [repr(error)])[0]
+            raise UserError(f"--light '{self.config.light}' cannot be read as an image ({reason}); give an "
+                            f"environment map such as an OpenEXR file.") from error
+        name = "light" + self.config.light.suffix
+        shutil.copyfile(self.config.light, folder / name)
+        return f"{self.output.stem}/{name}"
+
+    def _view_record(self, name: str, frame: Frame) -> dict:
+        stops = -np.log2(self.preparation.gains.get(frame.image, 1.0))
+        record = {"id": name, "image": str(frame.image)}
+        return record | ({"exposure_stops": round(float(stops), 4)} if self.preparation.gains else {})
+
+    def _record(self, views: list[dict], box: np.ndarray) -> dict:
+        options = {name: str(value) if isinstance(value, Path) else value
+                   for name, value in dataclasses.asdict(self.config).items() if value is not None}
+        return {"format": self.capture.format, "source": str(self.capture.source),
+                "capture_to_scene": self.to_scene.tolist(), "box": box.tolist(), "options": options,
+                "warnings": self.warnings, "views": views}
+
+
+def to_scene(capture: Capture, up: str) -> np.ndarray:
+    """(4, 4) rotation, by the smallest angle, that turns the capture's up to the scene's, +y.
+
+    Args:
+        up: see ``CaptureConfig.up``.
+    """
+    if up == "keep":
+        return np.eye(4)
+    direction = np.array(AXES[up]) if up in AXES else capture.up if up == "auto" else None
+    if direction is None:
+        direction = np.mean([frame.camera.up for frame in capture.frames], axis=0)
+        if np.linalg.norm(direction) < 0.2:    # turned every way
+            return np.eye(4)
+        direction /= np.linalg.norm(direction)
+    return _rotation_to_y(direction)
+
+
+def _rotation_to_y(direction: np.ndarray) -> np.ndarray:
+    """The smallest rotation of a unit vector to +y.
+
+    >>> _rotation_to_y(np.array([0.0, 0.0, 1.0]))[:3, :3] @ [1, 2, 3]
+    array([ 1.,  3., -2.])
+    """
+    result = np.eye(4)
+    cosine = direction[1]
+    if cosine < -1 + 1e-9:
+        result[:3, :3] = np.diag([1.0, -1.0, -1.0])
+        return result
+    axis = np.cross(direction, [0.0, 1.0, 0.0])
+    x, y, z = axis
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    result[:3, :3] = np.eye(3) + skew + skew @ skew / (1 + cosine)
+    return result
