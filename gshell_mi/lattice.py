@@ -1,8 +1,8 @@
-"""The lattice on which the fields live: a cube of cells, each split into six Kuhn tetrahedra."""
+"""The lattices on which the fields live: cubic cells, whole or split into tetrahedra."""
 
 import importlib
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -21,16 +21,16 @@ MAX_OFFSET_CELLS = 0.15
 
 
 @dataclass(frozen=True)
-class TetLattice:
-    """Kuhn tetrahedra on [-1, 1]^3 with ``resolution`` cells per side.
+class Lattice:
+    """Vertices on [-1, 1]^3 with ``resolution`` cells per side.
 
     Vertex ``(x, y, z)`` with 0 <= x, y, z <= resolution has the id ``x + y S + z S^2``,
     ``S = resolution + 1``: a flat field reshaped in NumPy's (C) order to ``(S, S, S)`` is indexed
-    ``[z, y, x]``. All lengths are in lattice units, in which the cube has the side 2.
+    ``[z, y, x]``. All lengths are in lattice units, in which the cube has the side 2. The subclasses
+    share the vertices and differ in how a surface is extracted from fields on them.
 
-    Each cell is split along the diagonal from its lowest to its highest corner (Kuhn 1960; Freudenthal
-    1942). The split is the same in every cell, so neighbours share their faces, and every edge and every
-    face of the lattice is its lowest vertex plus one of 7 edge or 12 face types (``extraction.tables``).
+    Raises:
+        UserError: the resolution is not between 1 and 800.
 
     >>> lattice = TetLattice(2)
     >>> lattice.vertex_count, lattice.spacing
@@ -38,6 +38,9 @@ class TetLattice:
     >>> lattice.vertex_positions()[5]
     array([ 1.,  0., -1.], dtype=float32)
     """
+
+    grid: ClassVar[str] = ""
+    """Name of the kind of lattice, the shape plugin's parameter ``grid``."""
 
     resolution: int
 
@@ -98,6 +101,47 @@ class TetLattice:
             dr.fma(float_t(row - z * stride), cell, -1),
             dr.fma(float_t(z), cell, -1),
         )
+
+
+@dataclass(frozen=True)
+class TetLattice(Lattice):
+    """Kuhn tetrahedra (``tet``): marching tetrahedra.
+
+    Each cell is split along the diagonal from its lowest to its highest corner (Kuhn 1960; Freudenthal
+    1942). The split is the same in every cell, so neighbours share their faces, and every edge and every
+    face of the lattice is its lowest vertex plus one of 7 edge or 12 face types
+    (``extraction.tet_tables``).
+    """
+
+    grid: ClassVar[str] = "tet"
+
+
+@dataclass(frozen=True)
+class CubeLattice(Lattice):
+    """Whole cubes (``cube``): marching cubes. A third of the vertices and half of the triangles of
+    ``TetLattice``."""
+
+    grid: ClassVar[str] = "cube"
+
+
+_KINDS: dict[str, type[Lattice]] = {kind.grid: kind for kind in (TetLattice, CubeLattice)}
+
+#: Names of the kinds of lattices.
+GRIDS: tuple[str, ...] = tuple(_KINDS)
+
+
+def make_lattice(grid: str, resolution: int) -> Lattice:
+    """The lattice of the kind ``grid``, one of ``GRIDS``.
+
+    Raises:
+        UserError: there is no such kind, or the resolution is out of range.
+
+    >>> make_lattice("cube", 32)
+    CubeLattice(resolution=32)
+    """
+    if grid not in _KINDS:
+        raise UserError(f"grid '{grid}' is not available; choose one of {', '.join(GRIDS)}")
+    return _KINDS[grid](resolution)
 
 
 def array_type(float_t: type, name: str) -> type:

@@ -12,7 +12,7 @@ from .errors import UserError
 from .extraction import SurfaceMesh, extract
 from .extraction.surface_mesh import gather
 from .fields import LatticeFields, from_mesh, sphere
-from .lattice import TetLattice
+from .lattice import make_lattice
 
 _FIELDS = ("sdf", "msdf", "deform")
 _LATTICE_PREFIX = "lattice_"
@@ -23,7 +23,7 @@ class GShell(mi.Mesh):
 
     ======================  =================================================================
     ``resolution``          integer: cells per side of the lattice (default: that of the file, or 64)
-    ``grid``                string: ``tet``
+    ``grid``                string: ``tet`` (default) or ``cube``, see ``lattice``
     ``to_world``            transform: maps the lattice's cube [-1, 1]^3 to the world
     ``filename``            string: initial fields: an .npz with ``sdf`` and, if wanted, ``msdf`` and
                             ``deform``, or a mesh file in world space (default: a sphere of radius 0.5
@@ -69,8 +69,6 @@ class GShell(mi.Mesh):
 
     def __init__(self, props: mi.Properties):
         grid = props.get("grid", "tet")
-        if grid != "tet":
-            raise UserError(f"gshell: grid '{grid}' is not available, only 'tet' is")
         resolution = int(props["resolution"]) if "resolution" in props else None
         self.filename = props.get("filename", "")
         smooth = not props.get("face_normals", False)
@@ -78,7 +76,7 @@ class GShell(mi.Mesh):
         compat.init_mesh(self, props, has_vertex_normals=smooth)
         self._attributes: dict[str, tuple[Any, int]] = {}
         self._mirrored = bool(np.linalg.det(np.array(self.to_world.matrix)[:3, :3]) < 0)
-        self.set_fields(_initial_fields(self.filename, resolution, self.to_world))
+        self.set_fields(_initial_fields(self.filename, grid, resolution, self.to_world))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         differentiable = mi.ParamFlags.Differentiable
@@ -138,7 +136,8 @@ class GShell(mi.Mesh):
 
     def fields(self) -> LatticeFields:
         """A copy of the present fields on the host."""
-        return LatticeFields(*(np.array(dr.detach(getattr(self, name))) for name in _FIELDS))
+        arrays = (np.array(dr.detach(getattr(self, name))) for name in _FIELDS)
+        return LatticeFields(*arrays, self.lattice.grid)
 
     def template(self) -> SurfaceMesh:
         """The watertight template of the present fields, in world space."""
@@ -180,8 +179,8 @@ class GShell(mi.Mesh):
 
     def to_string(self) -> str:
         return (
-            f"GShell[resolution={self.lattice.resolution}, vertices={self.surface.vertex_count}, "
-            f"faces={self.surface.face_count}]"
+            f"GShell[resolution={self.lattice.resolution}, grid={self.lattice.grid}, "
+            f"vertices={self.surface.vertex_count}, faces={self.surface.face_count}]"
         )
 
 
@@ -202,14 +201,14 @@ class _Padding:
         return dr.select(exists, padded, 0) if fill_with_zero else padded
 
 
-def _initial_fields(filename: str, resolution: int | None, to_world: Any) -> LatticeFields:
-    lattice = TetLattice(64 if resolution is None else resolution)
+def _initial_fields(filename: str, grid: str, resolution: int | None, to_world: Any) -> LatticeFields:
+    lattice = make_lattice(grid, 64 if resolution is None else resolution)
     if not filename:
         return sphere(lattice)
     path = mi.file_resolver().resolve(filename)
     if not str(path).endswith(".npz"):
         return from_mesh(str(path), lattice, to_world=np.array(to_world.matrix))
-    fields = LatticeFields.load(str(path))
+    fields = LatticeFields.load(str(path), grid)
     if resolution not in (None, fields.lattice.resolution):
         raise UserError(
             f"{path}: holds fields of resolution {fields.lattice.resolution}, but the shape asks for "

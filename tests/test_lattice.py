@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gshell_mi import UserError
-from gshell_mi.extraction.tables import TETS, corner_position
+from gshell_mi.extraction.tet_tables import TETS, corner_position
 from gshell_mi.lattice import MAX_OFFSET_CELLS, TetLattice
 
 

@@ -6,7 +6,7 @@ from topology import assert_manifold
 
 from gshell_mi import UserError
 from gshell_mi.fields import LatticeFields, sphere
-from gshell_mi.lattice import TetLattice
+from gshell_mi.lattice import GRIDS, TetLattice, make_lattice
 
 
 def _scene(**subject):
@@ -246,10 +246,20 @@ def test_fields_from_a_file(tmp_path):
         _scene(filename=str(path))
 
 
-@pytest.mark.parametrize("grid", ["cube", "flexicubes", "hexagons"])
-def test_other_grids_are_refused(grid):
-    with pytest.raises(RuntimeError, match=f"grid '{grid}' is not available, only 'tet' is"):
-        _scene(grid=grid)
+def test_unknown_grids_are_refused():
+    with pytest.raises(RuntimeError, match="grid 'hexagons' is not available; choose one of tet, cube"):
+        _scene(grid="hexagons")
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_every_grid_makes_a_mesh(grid):
+    scene = _scene(grid=grid)
+    subject = _subject(scene)
+    assert subject.lattice == make_lattice(grid, 16) and subject.fields().grid == grid
+    assert _depth(scene)[0] == pytest.approx(3.5, abs=0.02)
+    assert_manifold(*subject.surface.to_numpy()[:2])
+    subject.set_fields(sphere(make_lattice(grid, 12), 0.7))
+    assert subject.lattice == make_lattice(grid, 12)
 
 
 def test_bad_resolution():

@@ -5,13 +5,20 @@ from typing import Any
 import drjit as dr
 
 from ..errors import UserError
-from ..lattice import TetLattice
+from ..lattice import CubeLattice, Lattice, TetLattice
+from .cubes import CubeExtraction
+from .grid_extraction import GridExtraction
 from .surface_mesh import SurfaceMesh
 from .tetrahedra import TetExtraction
 
+_ALGORITHMS: dict[type[Lattice], type[GridExtraction]] = {
+    TetLattice: TetExtraction,
+    CubeLattice: CubeExtraction,
+}
+
 
 def extract(
-    lattice: TetLattice, sdf: Any, msdf: Any = None, deform: Any = None, *, template: bool = False
+    lattice: Lattice, sdf: Any, msdf: Any = None, deform: Any = None, *, template: bool = False
 ) -> SurfaceMesh:
     """The surface ``{sdf = 0, msdf >= 0}`` as a triangle mesh, differentiable in all three fields.
 
@@ -48,7 +55,7 @@ def extract(
         msdf = _checked("msdf", msdf, lattice.vertex_count)
     if deform is not None:
         deform = _checked("deform", deform, 3 * lattice.vertex_count)
-    return TetExtraction(lattice, type(sdf)).run(sdf, msdf, deform, template)
+    return _ALGORITHMS[type(lattice)](lattice, type(sdf)).run(sdf, msdf, deform, template)
 
 
 def _checked(name: str, field: Any, count: int) -> Any:

@@ -8,7 +8,7 @@ from scipy.fft import dstn, idstn
 from scipy.spatial import cKDTree
 
 from ..errors import UserError
-from ..lattice import TetLattice
+from ..lattice import Lattice
 from .lattice_fields import LatticeFields
 
 _BAND_CELLS = 3.0  # distances are exact and signs those of the nearest face this near the mesh
@@ -21,7 +21,7 @@ _RIM_CELLS = 2.0
 
 
 def from_mesh(
-    source: str | Path | trimesh.Trimesh, lattice: TetLattice, *, to_world: np.ndarray | None = None
+    source: str | Path | trimesh.Trimesh, lattice: Lattice, *, to_world: np.ndarray | None = None
 ) -> LatticeFields:
     """Fields whose surface is the mesh, to the accuracy of the lattice.
 
@@ -39,6 +39,7 @@ def from_mesh(
     Raises:
         UserError: the file cannot be read, holds no faces or does not fit into the lattice.
 
+    >>> from gshell_mi.lattice import TetLattice
     >>> fields = from_mesh(trimesh.creation.icosphere(radius=0.6), TetLattice(16))
     >>> bool((fields.msdf > 0).all()), round(float(fields.sdf[17**3 // 2]), 2)
     (True, -0.6)
@@ -74,12 +75,12 @@ def from_mesh(
 
     rim = _rim_samples(mesh, h / 8)
     if len(rim) == 0:
-        return LatticeFields.closed(sdf)
+        return LatticeFields.closed(sdf, lattice.grid)
     msdf = _SHEET_CELLS * h - distance
     rim_distance, _ = cKDTree(rim).query(closest)  # along the surface: 0 where its side ends
     msdf[band] = np.minimum(msdf[band], np.where(on_rim, -band_distance, rim_distance))
     closed = LatticeFields.closed(sdf)
-    return LatticeFields(closed.sdf, msdf.astype(np.float32), closed.deform)
+    return LatticeFields(closed.sdf, msdf.astype(np.float32), closed.deform, lattice.grid)
 
 
 def _load(source: str | Path | trimesh.Trimesh, name: str) -> trimesh.Trimesh:
@@ -154,7 +155,7 @@ def _rim_samples(mesh: trimesh.Trimesh, spacing: float) -> np.ndarray:
     return start[edge] + t[:, None] * (end - start)[edge]
 
 
-def _indicator_distance(lattice: TetLattice, samples: np.ndarray, area_normals: np.ndarray) -> np.ndarray:
+def _indicator_distance(lattice: Lattice, samples: np.ndarray, area_normals: np.ndarray) -> np.ndarray:
     """Signed distance to the level 1/2 of the indicator function, to first order.
 
     Solves laplace(chi) = -div(n delta) with chi = 0 on the border of the lattice.

@@ -7,14 +7,15 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import UserError
-from ..lattice import TetLattice
+from ..lattice import Lattice, make_lattice
 
 
 @dataclass(frozen=True)
 class LatticeFields:
-    """``sdf``, ``msdf`` and ``deform`` on the host, float32, in the order of ``TetLattice``'s vertices.
+    """``sdf``, ``msdf`` and ``deform`` on the host, float32, in the order of ``Lattice``'s vertices.
 
     >>> from gshell_mi.fields import sphere
+    >>> from gshell_mi.lattice import TetLattice
     >>> fields = sphere(TetLattice(8))
     >>> fields.lattice
     TetLattice(resolution=8)
@@ -26,24 +27,26 @@ class LatticeFields:
     """Manifold signed distance in lattice units, >= 0 on the surface, (n,)."""
     deform: np.ndarray
     """Offsets of the lattice vertices in [-1, 1], (3 n,): x0, y0, z0, x1, ..."""
+    grid: str = "tet"
+    """The kind of lattice, one of ``lattice.GRIDS``."""
 
     @classmethod
-    def closed(cls, sdf: np.ndarray) -> "LatticeFields":
+    def closed(cls, sdf: np.ndarray, grid: str = "tet") -> "LatticeFields":
         """Fields of a watertight surface: mSDF positive everywhere, no offsets."""
         sdf = np.asarray(sdf, np.float32).ravel()
-        return cls(sdf, np.ones_like(sdf), np.zeros(3 * sdf.size, np.float32))
+        return cls(sdf, np.ones_like(sdf), np.zeros(3 * sdf.size, np.float32), grid)
 
     @property
-    def lattice(self) -> TetLattice:
-        return TetLattice(round(self.sdf.size ** (1 / 3)) - 1)
+    def lattice(self) -> Lattice:
+        return make_lattice(self.grid, round(self.sdf.size ** (1 / 3)) - 1)
 
-    def resampled(self, resolution: int) -> "LatticeFields":
+    def to_lattice(self, resolution: int) -> "LatticeFields":
         """The fields on another lattice, interpolated trilinearly.
 
         Offsets are kept as lengths: they double in units of ``deform`` when the cells halve, and are
         clipped to what the new lattice allows.
         """
-        old, new = self.lattice, TetLattice(resolution)
+        old, new = self.lattice, make_lattice(self.grid, resolution)
 
         def zoom(values: np.ndarray) -> np.ndarray:
             volume = values.reshape((old.stride,) * 3)
@@ -52,7 +55,7 @@ class LatticeFields:
         scale = old.max_offset / new.max_offset
         deform = np.stack([zoom(self.deform[axis::3]) for axis in range(3)], axis=-1) * scale
         clipped = np.clip(deform, -1, 1).astype(np.float32)
-        return LatticeFields(zoom(self.sdf), zoom(self.msdf), clipped.ravel())
+        return LatticeFields(zoom(self.sdf), zoom(self.msdf), clipped.ravel(), self.grid)
 
     def save(self, path: str | Path) -> None:
         """Writes a compressed .npz with the arrays ``sdf``, ``msdf`` and ``deform``."""
@@ -60,8 +63,11 @@ class LatticeFields:
             np.savez_compressed(file, sdf=self.sdf, msdf=self.msdf, deform=self.deform)
 
     @classmethod
-    def load(cls, path: str | Path) -> "LatticeFields":
+    def load(cls, path: str | Path, grid: str = "tet") -> "LatticeFields":
         """Reads what ``save`` wrote; without ``msdf`` it is 1 and without ``deform`` 0 everywhere.
+
+        Args:
+            grid: the kind of lattice; the fields at its vertices can be used with any.
 
         Raises:
             UserError: the file cannot be read, has no ``sdf`` or arrays that do not fit together.
@@ -77,8 +83,8 @@ class LatticeFields:
         stride = round(sdf.size ** (1 / 3))
         if stride**3 != sdf.size or stride < 2:
             raise UserError(f"{path}: sdf has {sdf.size} values, which is not (resolution + 1)^3")
-        closed = cls.closed(sdf)
-        fields = cls(sdf, arrays.get("msdf", closed.msdf), arrays.get("deform", closed.deform))
+        closed = cls.closed(sdf, grid)
+        fields = cls(sdf, arrays.get("msdf", closed.msdf), arrays.get("deform", closed.deform), grid)
         for name, needed in (("msdf", sdf.size), ("deform", 3 * sdf.size)):
             size = getattr(fields, name).size
             if size != needed:

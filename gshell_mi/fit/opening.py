@@ -10,7 +10,7 @@ import numpy as np
 
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields.smoothing import LatticeDiffusion
-from ..lattice import TetLattice
+from ..lattice import Lattice
 from ..topology import vertex_components
 
 #: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
@@ -77,7 +77,7 @@ def _patches(label: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return vertex_components(edges[same], len(label))[1]
 
 
-def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: TetLattice) -> mi.Float:
+def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: Lattice) -> mi.Float:
     """ν at the lattice vertices such that its interpolation on the template follows ``logits``.
 
     The scale is about that of a distance: one cell per logit; where the template is far away, 1 cell.
@@ -88,7 +88,7 @@ def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: TetLa
 
 
 def splat_to_lattice(values: mi.Float, template: SurfaceMesh,
-                     lattice: TetLattice) -> tuple[mi.Float, mi.Bool]:
+                     lattice: Lattice) -> tuple[mi.Float, mi.Bool]:
     """Turns values at the template's vertices, one or three channels, into a lattice field.
 
     Each lattice vertex takes the mean of the template vertices on its edges, weighted as they

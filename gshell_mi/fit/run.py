@@ -18,7 +18,7 @@ from ..errors import UserError
 from ..export import check_output_folder, export_fit, make_output_folder
 from ..fields import LatticeFields
 from ..fields.visual_hull import visual_hull
-from ..lattice import TetLattice
+from ..lattice import make_lattice
 from ..light import EnvironmentLight
 from ..material import MaterialField, given_material
 from ..scene import load_fit_scene
@@ -94,7 +94,8 @@ class _Fit:
             self.views = PinholeViews.from_sensors(self.scene.sensors)
         if not all(target.has_alpha for target in self.scene.targets):
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
-        self.lattice = TetLattice(config.resolution or self.scene.subject.lattice.resolution)
+        given = self.scene.subject.lattice
+        self.lattice = make_lattice(given.grid, config.resolution or given.resolution)
         # Nothing of an earlier fit goes before all is known to be in order.
         make_output_folder(output, keep=resume)
 
@@ -135,7 +136,7 @@ class _Fit:
 
     def _start_from_file(self) -> None:
         """Starts from the fields that the scene's gshell shape was given, openings included."""
-        fields = self.scene.subject.fields().resampled(self.lattice.resolution)
+        fields = self.scene.subject.fields().to_lattice(self.lattice.resolution)
         if (fields.msdf > 0).all():
             self._enter("ghost", sdf=fields.sdf)
             return
@@ -156,7 +157,7 @@ class _Fit:
 
     def _ghost(self) -> None:
         sdf = self.checkpoint.arrays["sdf"]
-        self.scene.subject.set_fields(LatticeFields.closed(sdf))
+        self.scene.subject.set_fields(LatticeFields.closed(sdf, self.lattice.grid))
         template = self.scene.subject.template()
         vertices, faces, _ = template.to_numpy()
         pixels = PixelPool(self.views, self.scene.targets)
@@ -184,7 +185,7 @@ class _Fit:
     def _joint(self) -> JointStage:
         start = dict(self.checkpoint.arrays)
         deform = start.get("deform", np.zeros(3 * start["sdf"].size, np.float32))
-        fields = LatticeFields(start["sdf"], start["msdf"], deform)
+        fields = LatticeFields(start["sdf"], start["msdf"], deform, grid=self.lattice.grid)
         self.scene.subject.set_fields(fields)
         light = None
         if not self.config.known_light:

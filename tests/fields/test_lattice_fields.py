@@ -50,7 +50,7 @@ def test_resampling_keeps_linear_fields_and_lengths(resolution):
     p = old.vertex_positions()
     offset = np.array([0.1, -0.2, 0.3]) * p  # of at most 0.3 in units of the old cells
     fields = LatticeFields(p[:, 0], p @ np.float32([1, 2, 3]), offset.astype(np.float32).ravel())
-    result = fields.resampled(resolution)
+    result = fields.to_lattice(resolution)
     q = new.vertex_positions()
     assert result.lattice == new and result.sdf.dtype == result.deform.dtype == np.float32
     np.testing.assert_allclose(result.sdf, q[:, 0], atol=1e-5)

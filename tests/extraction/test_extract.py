@@ -9,7 +9,7 @@ from topology import assert_manifold, boundary_edges, component_count, euler_cha
 
 from gshell_mi import UserError
 from gshell_mi.extraction import extract
-from gshell_mi.lattice import TetLattice, array_type
+from gshell_mi.lattice import GRIDS, TetLattice, array_type, make_lattice
 
 SPECIAL = [0.0, -0.0, 1.0, -1.0, 1e-30, -1e-30, 1e-7, -1e-7, 1e-45, -1e-45, 3e38, -3e38, 0.25, -0.75]
 DENORMAL = 2.0**-126  # numbers below may count as 0
@@ -18,6 +18,11 @@ VALUES = st.one_of(
     st.floats(-1, 1, width=32),
     st.floats(width=32, allow_nan=False, allow_infinity=False),
 )
+
+
+@pytest.fixture(params=GRIDS)
+def grid(request) -> str:
+    return request.param
 
 
 def _mesh(lattice, sdf, msdf=None, deform=None, **kwargs):
@@ -53,7 +58,7 @@ def _positive_border(lattice, sdf) -> bool:
 
 @st.composite
 def _fields(draw):
-    lattice = TetLattice(draw(st.integers(1, 3)))
+    lattice = make_lattice(draw(st.sampled_from(GRIDS)), draw(st.integers(1, 3)))
     n = lattice.vertex_count
     sdf = draw(arrays(np.float32, n, elements=VALUES, fill=st.nothing()))
     if draw(st.booleans()):
@@ -76,14 +81,15 @@ def test_guarantee_on_any_finite_fields(fields):
 
 @settings(max_examples=60, deadline=None)
 @given(
+    grid=st.sampled_from(GRIDS),
     seed=st.integers(0, 2**32 - 1),
     resolution=st.integers(4, 12),
     levels=st.sampled_from([None, 1, 2, 50]),
     deformed=st.booleans(),
 )
-def test_guarantee_on_random_lattices(seed, resolution, levels, deformed):
+def test_guarantee_on_random_lattices(grid, seed, resolution, levels, deformed):
     """Random fields without limit, or rounded to few levels so that many values are exactly 0."""
-    lattice = TetLattice(resolution)
+    lattice = make_lattice(grid, resolution)
     rng = np.random.default_rng(seed)
     sdf, msdf = rng.uniform(-1.5, 1.5, (2, lattice.vertex_count))
     if levels:
@@ -92,23 +98,23 @@ def test_guarantee_on_random_lattices(seed, resolution, levels, deformed):
     _assert_guarantee(_mesh(lattice, sdf, msdf, deform, template=True), lattice, sdf, msdf)
 
 
-def test_no_degenerate_faces_at_high_resolution():
-    lattice = TetLattice(32)
+def test_no_degenerate_faces_at_high_resolution(grid):
+    lattice = make_lattice(grid, 32)
     sdf, msdf = np.random.default_rng(0).integers(-1, 2, (2, lattice.vertex_count))
     _assert_guarantee(_mesh(lattice, sdf, msdf, template=True), lattice, sdf, msdf)
 
 
 @pytest.mark.parametrize("value", [1.0, 0.0, -1.0])
-def test_no_sign_change_gives_an_empty_mesh(value):
-    lattice = TetLattice(3)
+def test_no_sign_change_gives_an_empty_mesh(grid, value):
+    lattice = make_lattice(grid, 3)
     mesh = _mesh(lattice, np.full(64, value), np.ones(64), template=True)
     assert mesh.is_empty and mesh.template.is_empty and mesh.vertex_count == 0
     assert dr.width(mesh.interpolate(dr.zeros(mi.Float, 64))) == 0
     assert len(mesh.to_trimesh().faces) == 0
 
 
-def test_everything_cut_away():
-    lattice = TetLattice(8)
+def test_everything_cut_away(grid):
+    lattice = make_lattice(grid, 8)
     mesh = extract(lattice, _ball(lattice), dr.full(mi.Float, -1, lattice.vertex_count), template=True)
     assert mesh.is_empty and mesh.template.face_count > 0 and mesh.template.kept_vertex_count == 0
 
@@ -128,11 +134,11 @@ def _ball(lattice, radius=0.6):
     return dr.norm(lattice.points(mi.Float)) - radius
 
 
-def test_sphere():
+def test_sphere(grid):
     """Genus, area and volume; the error falls with the square of the resolution."""
     errors = []
     for resolution in (16, 32, 64):
-        mesh = extract(TetLattice(resolution), _ball(TetLattice(resolution)))
+        mesh = extract((lattice := make_lattice(grid, resolution)), _ball(lattice))
         solid = mesh.to_trimesh()
         assert_manifold(solid.vertices, solid.faces)
         assert solid.is_watertight and solid.euler_number == 2
@@ -142,16 +148,16 @@ def test_sphere():
     assert np.log2(errors[:-1] / errors[1:]) == pytest.approx(2, abs=0.25)
 
 
-def test_torus():
-    lattice = TetLattice(32)
+def test_torus(grid):
+    lattice = make_lattice(grid, 32)
     p = lattice.points(mi.Float)
     torus = dr.norm(mi.Vector2f(dr.norm(mi.Vector2f(p.x, p.y)) - 0.6, p.z)) - 0.25
     _, faces, _ = extract(lattice, torus).to_numpy()
     assert (euler_characteristic(faces), component_count(faces)) == (0, 1)
 
 
-def test_half_sphere():
-    lattice = TetLattice(64)
+def test_half_sphere(grid):
+    lattice = make_lattice(grid, 64)
     z = lattice.points(mi.Float).z
     mesh = extract(lattice, _ball(lattice), 0.1234 - z)
     vertices, faces, values = mesh.to_numpy()
@@ -166,8 +172,8 @@ def test_half_sphere():
 
 
 @pytest.mark.parametrize(("holes", "chi"), [(1, 1), (2, 0), (6, -4)])
-def test_sphere_with_holes(holes, chi):
-    lattice = TetLattice(32)
+def test_sphere_with_holes(grid, holes, chi):
+    lattice = make_lattice(grid, 32)
     p = lattice.points(mi.Float)
     axes = [p.x, -p.x, p.y, -p.y, p.z, -p.z][:holes]
     msdf = axes[0] * -1 + 0.5
@@ -177,8 +183,8 @@ def test_sphere_with_holes(holes, chi):
     assert (loop_count(faces), euler_characteristic(faces)) == (holes, chi)
 
 
-def test_positive_msdf_gives_the_template():
-    lattice = TetLattice(20)
+def test_positive_msdf_gives_the_template(grid):
+    lattice = make_lattice(grid, 20)
     sdf = _ball(lattice)
     ones = dr.full(mi.Float, 0.3, lattice.vertex_count)
     for mesh in (extract(lattice, sdf, ones, template=True), extract(lattice, sdf, template=True)):
@@ -187,8 +193,8 @@ def test_positive_msdf_gives_the_template():
         assert mesh.to_trimesh().is_watertight
 
 
-def test_surface_ends_at_the_border_of_the_lattice():
-    lattice = TetLattice(10)
+def test_surface_ends_at_the_border_of_the_lattice(grid):
+    lattice = make_lattice(grid, 10)
     vertices, faces, _ = extract(lattice, lattice.points(mi.Float).z - 0.05).to_numpy()
     assert_manifold(vertices, faces)
     assert (loop_count(faces), euler_characteristic(faces)) == (1, 1)
@@ -199,8 +205,8 @@ def test_surface_ends_at_the_border_of_the_lattice():
     assert (np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, 2] > 0).all(), "outwards is upwards"
 
 
-def test_offsets_are_clipped_and_scaled():
-    lattice = TetLattice(4)
+def test_offsets_are_clipped_and_scaled(grid):
+    lattice = make_lattice(grid, 4)
     n = lattice.vertex_count
     sdf = lattice.points(mi.Float).z - 0.25
     plain = extract(lattice, sdf)
@@ -221,9 +227,9 @@ def test_deform_layouts_agree():
         np.testing.assert_array_equal(np.array(flat.vertices), np.array(other.vertices))
 
 
-def test_interpolate_reproduces_positions():
+def test_interpolate_reproduces_positions(grid):
     """Linear fields are interpolated exactly, scalar and vector, on cut vertices too."""
-    lattice = TetLattice(12)
+    lattice = make_lattice(grid, 12)
     p = lattice.points(mi.Float)
     mesh = extract(lattice, _ball(lattice), p.x + 0.3 * p.y, template=True)
     assert mesh.vertex_count > mesh.kept_vertex_count > 0
@@ -279,9 +285,9 @@ def test_wrong_sizes(sizes, message):
 
 
 def test_too_many_vertices(monkeypatch):
-    from gshell_mi.extraction import tetrahedra
+    from gshell_mi.extraction import grid_extraction
 
-    monkeypatch.setattr(tetrahedra, "_MAX_VERTICES", 100)
+    monkeypatch.setattr(grid_extraction, "_MAX_VERTICES", 100)
     lattice = TetLattice(8)
     with pytest.raises(UserError, match="more than the 100 supported; sdf should be smoother"):
         extract(lattice, _ball(lattice))

@@ -3,7 +3,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from gshell_mi.extraction import tables
+from gshell_mi.extraction import tet_tables as tables
 
 
 def test_types():
