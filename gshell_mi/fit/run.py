@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
-from ..export import check_output_folder, export_fit, make_output_folder
+from ..export import check_output_folder, export_fit, make_output_folder, write_metrics
 from ..fields import LatticeFields
 from ..fields.visual_hull import visual_hull
 from ..lattice import make_lattice
@@ -109,7 +109,8 @@ class _Fit:
             joint = self._joint()
             self.interrupt.check()
             with self.progress.stage("export", None), self._timed("export"):
-                metrics = export_fit(self.output, self.scene, joint, self.config, self.checkpoint.seconds)
+                metrics = export_fit(self.output, self.scene, joint, self.config)
+            metrics = write_metrics(self.output, metrics, self.checkpoint.seconds)
         except OSError as error:
             raise UserError(f"'{error.filename or self.output}' cannot be written "
                             f"({error.strerror or error}); free some space or mend its permissions, then "

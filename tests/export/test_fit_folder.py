@@ -12,14 +12,9 @@ from PIL import Image
 from topology import loop_count
 
 from gshell_mi import UserError
-from gshell_mi.export import (
-    _write_light,
-    _write_mesh,
-    _write_scene,
-    check_output_folder,
-    export_fit,
-    make_output_folder,
-)
+from gshell_mi.export import check_output_folder, export_fit, make_output_folder, write_metrics
+from gshell_mi.export.ply import read_ply, write_ply
+from gshell_mi.export.stock_scene import up_axis, write_light, write_scene
 from gshell_mi.fields import LatticeFields, sphere
 from gshell_mi.fit.config import FitConfig
 from gshell_mi.fit.joint import JointStage
@@ -44,7 +39,7 @@ def exported(bowl_scene, tmp_path_factory):
     config = FitConfig(spp=1, primal_spp=1)
     joint = JointStage(fit, material, EnvironmentLight(radiance), config)
     joint.finish()
-    metrics = export_fit(output, fit, joint, config, {"hull": 1.5, "joint": 2.0})
+    metrics = write_metrics(output, export_fit(output, fit, joint, config), {"hull": 1.5, "joint": 2.0})
     return SimpleNamespace(output=output, fit=fit, joint=joint, metrics=metrics, radiance=radiance)
 
 
@@ -102,8 +97,8 @@ def test_scene_is_the_fitted_one(exported):
     """Stock Mitsuba sees from the first view what the fit's own scene shows there."""
     scene = mi.load_file(str(exported.output / "scene.xml"))
     assert [shape.class_name() for shape in scene.shapes()] == ["PLYMesh"]
-    (sensor,) = scene.sensors()
-    first = exported.fit.sensors[0]
+    assert [sensor.id() for sensor in scene.sensors()] == [f"view_{i:03}" for i in range(VIEWS)]
+    sensor, first = scene.sensors()[0], exported.fit.sensors[0]
     assert sensor.id() == first.id() == "view_000"
     film = mi.Point2f([0.1, 0.5, 0.9], [0.3, 0.5, 0.8])
     ours, theirs = (s.sample_ray(0, 0.5, film, mi.Point2f(0.5))[0] for s in (sensor, first))
@@ -121,6 +116,7 @@ SENSORS = {
     "fov along y": {"type": "perspective", "fov": 50, "fov_axis": "y"},
     "principal point": {"type": "perspective", "fov": 35, "principal_point_offset_x": 0.1,
                         "principal_point_offset_y": -0.2},
+    "thin lens": {"type": "thinlens", "fov": 35, "aperture_radius": 0.1, "focus_distance": 2.5},
 }
 
 
@@ -134,12 +130,13 @@ def test_any_perspective_sensor_survives(exported, tmp_path, kind, crop):
     sensor = mi.load_dict(SENSORS[kind] | {"to_world": to_world, "film": film, "id": "view_007"})
     for name in ("mesh.ply", "light.exr"):
         (tmp_path / name).write_bytes((exported.output / name).read_bytes())
-    _write_scene(tmp_path / "scene.xml", SimpleNamespace(sensors=[sensor], light=exported.fit.light))
+    write_scene(tmp_path / "scene.xml", exported.fit.light, [sensor])
     (written,) = mi.load_file(str(tmp_path / "scene.xml")).sensors()
     assert written.id() == "view_007"
     assert tuple(written.film().crop_size()) == tuple(sensor.film().crop_size())
     at = mi.Point2f(np.random.default_rng(3).random((2, 50)).astype(np.float32))
-    ours, theirs = (s.sample_ray(0, 0.5, at, mi.Point2f(0.5))[0] for s in (written, sensor))
+    ours, theirs = (s.sample_ray(0, 0.5, at, mi.Point2f(0.1, 0.8))[0] for s in (written, sensor))
+    np.testing.assert_allclose(np.array(ours.o), np.array(theirs.o), atol=1e-5)
     np.testing.assert_allclose(np.array(ours.d), np.array(theirs.d), atol=1e-5)
 
 
@@ -164,9 +161,9 @@ def test_light_survives(exported, tmp_path, light, optimised):
     if optimised and found is None:
         found = EnvironmentLight(exported.radiance)
         emitter = found.emitter()
-    fit = SimpleNamespace(light=mi.load_dict(light), sensors=exported.fit.sensors)
-    _write_light(tmp_path / "light.exr", fit, SimpleNamespace(light=found))
-    _write_scene(tmp_path / "scene.xml", fit)
+    given = mi.load_dict(light)
+    write_light(tmp_path / "light.exr", given, found)
+    write_scene(tmp_path / "scene.xml", given, exported.fit.sensors)
     (tmp_path / "mesh.ply").write_bytes((exported.output / "mesh.ply").read_bytes())
     written = mi.load_file(str(tmp_path / "scene.xml")).environment()
     np.testing.assert_allclose(look(written), look(emitter), rtol=2e-3)
@@ -190,18 +187,40 @@ def test_metrics(exported, mesh):
     assert stored["config"]["spp"] == 1 and stored["variant"] == mi.variant()
 
 
+def test_mesh_round_trip(exported, mesh, tmp_path):
+    read = read_ply(exported.output / "mesh.ply")
+    np.testing.assert_array_equal(read.vertices, mesh.vertices)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    assert {name: values.shape[1:] for name, values in read.attributes.items()} == {
+        "color": (3,), "roughness": (), "metallic": ()}
+    write_ply(tmp_path / "again.ply", read.vertices, read.faces, read.normals, read.attributes)
+    again = read_ply(tmp_path / "again.ply")
+    np.testing.assert_array_equal(again.attributes["color"], read.attributes["color"])
+    np.testing.assert_array_equal(again.normals, read.normals)
+
+
+def test_missing_and_broken_mesh(tmp_path):
+    with pytest.raises(UserError, match="does not exist; give the folder of a finished fit"):
+        read_ply(tmp_path / "mesh.ply")
+    (tmp_path / "mesh.ply").write_text("ply\nnonsense")
+    with pytest.raises(UserError, match="cannot be read as a fitted mesh"):
+        read_ply(tmp_path / "mesh.ply")
+
+
 def test_empty_mesh(tmp_path):
     attributes = {"vertex_color": np.zeros((0, 3)), "vertex_roughness": np.zeros(0)}
-    _write_mesh(tmp_path / "mesh.ply", np.zeros((0, 3)), np.zeros((0, 3), int), attributes)
+    write_ply(tmp_path / "mesh.ply", np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)), attributes)
     header = (tmp_path / "mesh.ply").read_text()
     assert "element vertex 0\n" in header and "element face 0\n" in header and header.endswith("end_header\n")
 
 
-def test_unused_and_flat_vertices_have_no_nan_among_their_normals(tmp_path):
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]], np.float32)
-    _write_mesh(tmp_path / "mesh.ply", vertices, np.array([[0, 1, 2]]), {})
-    data = trimesh.load(tmp_path / "mesh.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
-    assert all(np.isfinite(data[name]).all() for name in ("nx", "ny", "nz"))
+@pytest.mark.parametrize("axis, up", list(enumerate(np.concatenate([np.eye(3), -np.eye(3)]))))
+def test_up_axis(axis, up):
+    # One view from above tells nothing about the others' up.
+    rng = np.random.default_rng(axis)
+    sensors = [mi.load_dict({"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(
+        list(rng.normal(size=3) + 2 * up), [0, 0, 0], list(up))}) for _ in range(12)]
+    assert up_axis(sensors) == axis
 
 
 # --- the folder

@@ -1,0 +1,82 @@
+"""The folder that a fit leaves behind; everything in it opens without this package."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import mitsuba as mi
+import numpy as np
+
+from ..images import over_white, psnr, triptych, write_png
+from ..topology import topology
+from .ply import write_ply
+from .stock_scene import MAX_DEPTH, write_light, write_scene
+
+if TYPE_CHECKING:
+    from ..extraction import SurfaceMesh
+    from ..fit.config import FitConfig
+    from ..fit.joint import JointStage
+    from ..scene import FitScene
+
+_EXPORT_SPP = 32
+
+
+def export_fit(output: Path, fit: FitScene, joint: JointStage, config: FitConfig) -> dict:
+    """Writes meshes, light, scene and triptychs; returns the metrics, which ``write_metrics`` stores."""
+    surface = fit.subject.surface
+    attributes = {}
+    for name, field in joint.material.values().items():
+        channels = 3 if name == "vertex_color" else 1
+        values = np.array(surface.interpolate(field, channels).numpy())
+        attributes[name] = values.T if channels == 3 else values
+    _write_surface(output / "mesh.ply", surface, attributes)
+    template = fit.subject.template()
+    _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
+    write_light(output / "light.exr", fit.light, joint.light)
+    write_scene(output / "scene.xml", fit.light, fit.sensors)
+    scores = _write_views(output, fit)
+    vertices, faces, _ = surface.to_numpy()
+    return {
+        "scene": fit.path.name,
+        "targets": str(fit.targets[0].path.parent.absolute()),
+        "psnr_training": round(float(np.mean(list(scores.values()))), 3),
+        "psnr_per_view": {name: round(score, 3) for name, score in scores.items()},
+        "counts": dataclasses.asdict(topology(vertices, faces)),
+        "versions": {name: version(name) for name in ("gshell_mi", "mitsuba", "drjit", "numpy")},
+        "variant": mi.variant(),
+        "config": dataclasses.asdict(config),
+    }
+
+
+def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dict:
+    """Writes ``metrics.json`` in one step, with the seconds per stage and their sum; returns its contents."""
+    metrics = metrics | {"seconds": {**seconds, "total": round(sum(seconds.values()), 3)}}
+    partial = output / ".metrics.json.partial"
+    partial.write_text(json.dumps(metrics, indent=1))
+    os.replace(partial, output / "metrics.json")
+    return metrics
+
+
+def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.ndarray]) -> None:
+    vertices, faces, _ = surface.to_numpy()
+    normals = np.array(surface.vertex_normals().numpy()).T.reshape(-1, 3)
+    write_ply(path, vertices, faces, normals, attributes)
+
+
+def _write_views(output: Path, fit: FitScene) -> dict[str, float]:
+    """Renders the exported scene from the training views; writes triptychs, returns PSNR by view id."""
+    folder = output / "views"
+    folder.mkdir(exist_ok=True)
+    scene = mi.load_file(str(output / "scene.xml"))
+    integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
+    scores = {}
+    for sensor, target in zip(fit.sensors, fit.targets, strict=True):
+        image = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=_EXPORT_SPP))
+        scores[sensor.id()] = psnr(over_white(image), over_white(target.rgba))
+        write_png(folder / f"{sensor.id()}.png", triptych(target.rgba, image))
+    return scores
