@@ -24,6 +24,7 @@ from .camera import Camera
 from .formats.mitsuba import camera_of
 from .region import Silhouette
 from .trouble import Thumbnail, find_trouble
+from .writer import read_record
 
 #: Pixels of a thumbnail's longer side, and of the two pictures of the cameras.
 _THUMB, _OVERVIEW = 240, 560
@@ -86,8 +87,12 @@ class _Sheet:
         self.center, self.half = to_world[:3, 3], np.abs(to_world[:3, :3]).sum(axis=1).max()
         views = PinholeViews.from_sensors(scene.sensors)
         self.cameras = [camera_of(sensor, views, i) for i, sensor in enumerate(scene.sensors)]
-        self.thumbnails = [Thumbnail.of(sensor.id(), target.rgba, camera) for sensor, target, camera
-                           in zip(scene.sensors, scene.targets, self.cameras, strict=True)]
+        photographs = read_record(scene.path.with_suffix(""))
+        self.thumbnails = []
+        for sensor, target, camera in zip(scene.sensors, scene.targets, self.cameras, strict=True):
+            image, clipped = photographs.get(sensor.id(), (None, 0.0))
+            name = f"{sensor.id()} ({Path(image).name})" if image else sensor.id()
+            self.thumbnails.append(Thumbnail.of(name, target.rgba, camera, clipped))
         box = np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
         self.warnings = find_trouble(self.thumbnails, box, has_alpha=all(t.has_alpha for t in scene.targets))
         self.hull = _hull(scene, [thumbnail.silhouette for thumbnail in self.thumbnails])

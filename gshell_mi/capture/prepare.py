@@ -21,6 +21,21 @@ _BRIGHTEST = 6e4
 
 
 @dataclass(frozen=True)
+class Prepared:
+    """A target and what became of its photograph.
+
+    Attributes:
+        rgba: (height, width, 4) float32, linear Rec.709, premultiplied by alpha = coverage.
+        camera: the one with square pixels and without distortion that sees it.
+        clipped: share of the object's pixels at the largest value of an integer file.
+    """
+
+    rgba: np.ndarray
+    camera: Camera
+    clipped: float
+
+
+@dataclass(frozen=True)
 class Preparation:
     """What is done to every photograph.
 
@@ -36,12 +51,8 @@ class Preparation:
     max_size: int = 0
     gains: dict[Path, float] = field(default_factory=dict)
 
-    def target(self, frame: Frame) -> tuple[np.ndarray, Camera]:
-        """The target image of a frame and its pinhole camera.
-
-        Returns:
-            (height, width, 4) float32, linear Rec.709, premultiplied by alpha = coverage; and the camera
-            with square pixels and without distortion that sees it.
+    def target(self, frame: Frame) -> Prepared:
+        """The target of a frame.
 
         Raises:
             UserError: the image or its mask cannot be used.
@@ -59,12 +70,19 @@ class Preparation:
         rgb = np.minimum(rgb * self.gains.get(frame.image, 1.0), _BRIGHTEST)
         image = np.concatenate([rgb, coverage], axis=-1).astype(np.float32)
         # The lens formula is in units of the focal length, so it holds for the small image, at less cost.
-        return rectify(*shrink(image, frame.camera, self.max_size))
+        return Prepared(*rectify(*shrink(image, frame.camera, self.max_size)), _clipped(pixels, coverage))
 
     @staticmethod
     def _encoded(color: tuple[float, float, float], dtype: np.dtype) -> np.ndarray:
         value = np.array(color).reshape(1, 1, 3)
         return np.round(value * np.iinfo(dtype).max).astype(dtype) if dtype.kind == "u" else value
+
+
+def _clipped(pixels: np.ndarray, coverage: np.ndarray) -> float:
+    covered = coverage[..., 0] > 0.99
+    if pixels.dtype.kind != "u" or not covered.any():
+        return 0.0
+    return float((pixels[covered][:, :3] == np.iinfo(pixels.dtype).max).any(axis=1).mean())
 
 
 def _is_premultiplied(frame: Frame, pixels: np.ndarray) -> bool:

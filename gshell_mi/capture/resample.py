@@ -66,8 +66,8 @@ def _area_weights(size: int, new: int, scale: float) -> sparse.csr_array:
 def rectify(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
     """Resamples to a camera with square pixels and no distortion, as Mitsuba's ``perspective`` is one.
 
-    Size, principal point and the focal length ``fx`` stay. Cubic interpolation; what lies beyond the
-    image's edge repeats it, so that an object that the frame cuts off still reaches the frame.
+    Size, principal point and the focal length ``fx`` stay. What lies beyond the image's edge repeats it, so
+    that an object that the frame cuts off still reaches the frame.
 
     Returns:
         The image and its camera; both unchanged if there is nothing to do.
@@ -82,8 +82,18 @@ def rectify(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
     radius = np.linalg.norm(ideal, axis=-1, keepdims=True)
     ideal *= np.minimum(1.0, 0.999 * camera.distortion.folds_at() / np.maximum(radius, 1e-9))
     seen = camera.distortion.apply(ideal) * [camera.fx, camera.fy] + [camera.cx, camera.cy] - 0.5
-    channels = [ndimage.map_coordinates(image[..., c], [seen[..., 1], seen[..., 0]], order=3, mode="nearest")
-                for c in range(image.shape[2])]
-    result = np.maximum(np.stack(channels, axis=-1), 0.0)    # cubic kernels overshoot
-    result[..., 3:] = np.minimum(result[..., 3:], 1.0)
-    return result.astype(np.float32), straight
+    return _sample(image, seen[..., 1], seen[..., 0]), straight
+
+
+def _sample(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Cubic interpolation at pixel indices, kept within the range of the four pixels around.
+
+    Without that limit it rings at the sharp edge of a mask.
+    """
+    height, width, channels = image.shape
+    rows = [np.clip(np.floor(row).astype(int) + step, 0, height - 1) for step in (0, 1)]
+    columns = [np.clip(np.floor(column).astype(int) + step, 0, width - 1) for step in (0, 1)]
+    around = np.stack([image[r, c] for r in rows for c in columns])
+    cubic = np.stack([ndimage.map_coordinates(image[..., c], [row, column], order=3, mode="nearest")
+                      for c in range(channels)], axis=-1)
+    return np.clip(cubic, around.min(axis=0), around.max(axis=0))

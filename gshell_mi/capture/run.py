@@ -97,19 +97,20 @@ class _Import:
         tests: dict[str, Camera] = {}
         thumbnails, views, empty = [], [], []
         for index, frame in enumerate(self.capture.frames):
-            rgba, camera = self.preparation.target(frame)
-            if not frame.held_out and not (rgba[..., 3] >= 0.5).any():
+            target = self.preparation.target(frame)
+            if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
                 empty.append(frame.image.name)    # it would carve away everything that it frames
                 continue
             kind, group = ("test", tests) if frame.held_out else ("view", cameras)
             name = f"{kind}_{len(group):03}"
             place = folder / "test" if frame.held_out else folder
             place.mkdir(exist_ok=True)
-            write_target(place / f"{name}.exr", rgba)
-            group[name] = camera
+            write_target(place / f"{name}.exr", target.rgba)
+            group[name] = target.camera
             if not frame.held_out:
-                thumbnails.append(Thumbnail.of(f"{name} ({frame.image.name})", rgba, camera))
-            views.append(self._view_record(name, frame))
+                thumbnails.append(Thumbnail.of(f"{name} ({frame.image.name})", target.rgba, target.camera,
+                                               target.clipped))
+            views.append(self._view_record(name, frame, target.clipped))
             if self.progress:
                 self.progress(index + 1, len(self.capture.frames))
         if not cameras:
@@ -167,10 +168,11 @@ class _Import:
         shutil.copyfile(self.config.light, folder / name)
         return f"{self.output.stem}/{name}"
 
-    def _view_record(self, name: str, frame: Frame) -> dict:
-        stops = -np.log2(self.preparation.gains.get(frame.image, 1.0))
-        record = {"id": name, "image": str(frame.image)}
-        return record | ({"exposure_stops": round(float(stops), 4)} if self.preparation.gains else {})
+    def _view_record(self, name: str, frame: Frame, clipped: float) -> dict:
+        record = {"id": name, "image": str(frame.image), "clipped": round(clipped, 4)}
+        if self.preparation.gains:
+            record["exposure_stops"] = round(-float(np.log2(self.preparation.gains[frame.image])), 4)
+        return record
 
     def _record(self, views: list[dict], box: np.ndarray) -> dict:
         options = {name: str(value) if isinstance(value, Path) else value

@@ -15,6 +15,8 @@ from .resample import shrink
 ENOUGH_VIEWS = 20
 #: Spread of encoded colour below which an image shows nothing that could be matched between views.
 _ONE_COLOR = 0.012
+#: Share of the object that may be clipped unnoticed.
+_CLIPPED = 0.02
 
 
 @dataclass(frozen=True)
@@ -25,16 +27,18 @@ class Thumbnail:
         name: the sensor's id, and the photograph's file if known.
         camera: of the small image.
         rgba: (height, width, 4) linear, premultiplied.
+        clipped: share of the object's pixels that the photograph clipped, as far as known.
     """
 
     name: str
     camera: Camera
     rgba: np.ndarray
+    clipped: float = 0.0
 
     @classmethod
-    def of(cls, name: str, rgba: np.ndarray, camera: Camera) -> Thumbnail:
+    def of(cls, name: str, rgba: np.ndarray, camera: Camera, clipped: float = 0.0) -> Thumbnail:
         small, camera = shrink(rgba, camera, MASK_SIZE)
-        return cls(name, camera, small)
+        return cls(name, camera, small, clipped)
 
     @property
     def silhouette(self) -> Silhouette:
@@ -84,25 +88,21 @@ def _is_inverted(alpha: np.ndarray) -> bool:
 
 
 def _colors(thumbnails: list[Thumbnail]) -> list[str]:
-    found, flat, clipped = [], [], []
-    brightest = max(float(t.rgba[..., :3].max()) for t in thumbnails)
-    for t in thumbnails:
-        covered = t.rgba[..., 3] > 0.99
-        if not covered.any():
-            continue
-        rgb = t.rgba[covered][:, :3]
-        if srgb(rgb / max(brightest, 1e-6)).std(axis=0).max() < _ONE_COLOR:
-            flat.append(t)
-        if (rgb.max(axis=1) > 0.999 * brightest).mean() > 0.02:
-            clipped.append(t)
+    found = []
+    flat = [t for t in thumbnails if _is_flat(t.rgba)]
     if flat:
         found.append(f"The images {_names(flat)} are nearly all one colour on the object; nothing in them "
                      f"can be matched with other views.")
-    elif clipped:
-        found.append(f"The brightest value fills more than 2 % of the object in {_names(clipped)}: "
-                     f"highlights are clipped, and the light will come out too dim; expose less, or shoot "
-                     "raw or HDR.")
+    clipped = sorted((t for t in thumbnails if t.clipped > _CLIPPED), key=lambda t: -t.clipped)
+    if clipped:
+        found.append(f"Highlights are clipped in {_names(clipped)} (up to {100 * clipped[0].clipped:.0f} % "
+                     f"of the object): the light will come out too dim; expose less, or shoot raw or HDR.")
     return found
+
+
+def _is_flat(rgba: np.ndarray) -> bool:
+    rgb = rgba[rgba[..., 3] > 0.99][:, :3]
+    return len(rgb) > 0 and bool(srgb(rgb / max(rgb.max(), 1e-6)).std(axis=0).max() < _ONE_COLOR)
 
 
 def _geometry(seen: list[Thumbnail], box: np.ndarray) -> list[str]:

@@ -101,6 +101,18 @@ def write_record(folder: Path, record: dict) -> None:
     (folder / RECORD).write_text(text, encoding="utf-8", errors="surrogateescape")
 
 
+def read_record(folder: Path) -> dict[str, tuple[str, float]]:
+    """By sensor id the photograph that an import made the target of, and the share that it had clipped.
+
+    Empty if no import wrote the folder.
+    """
+    try:
+        views = json.loads((folder / RECORD).read_text(encoding="utf-8", errors="surrogateescape"))["views"]
+        return {view["id"]: (view["image"], float(view["clipped"])) for view in views}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
 @contextmanager
 def staged(output: Path, *, overwrite: bool, source: Path) -> Iterator[Path]:
     """A temporary folder that becomes ``output`` (an XML file) and the folder of its stem at the end.
