@@ -285,11 +285,11 @@ def test_disk_full_at_a_checkpoint(told, stopped, monkeypatch):
     assert not list(stopped.glob(".*")), "no remains"
 
 
-@pytest.mark.parametrize("writer", ["_write_mesh", "_write_views"])
+@pytest.mark.parametrize("writer", ["_write_surface", "_write_views"])
 def test_disk_full_at_export(told, scene, tmp_path, monkeypatch, writer):
     output = tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr(f"gshell_mi.export.{writer}", _full)
+        patch.setattr(f"gshell_mi.export.fit_folder.{writer}", _full)
         assert "No space left on device" in told(*CLOSED, "--iterations", "1", whole=True)
     assert not (output / "metrics.json").exists()
     assert main([str(scene), "-o", str(output), *SHORT, *CLOSED, "--iterations", "1", "--resume"]) == 0
