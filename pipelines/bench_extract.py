@@ -1,6 +1,6 @@
 """Times the extraction against ``skimage.measure.marching_cubes``, on one thread and in one process.
 
-    python pipelines/bench_extract.py [--resolutions 64 128 256] [--repeats 7]
+    python pipelines/bench_extract.py [--grids tet cube] [--resolutions 64 128 256] [--repeats 7]
 
 The surface is a shirt: a torso and two sleeves, open at neck, hem and wrists. Every repeat gets new arrays
 (copies of the fields), so that nothing is reused but compiled kernels; the contestants take turns, and the
@@ -16,6 +16,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 
 import drjit as dr
 import drjit.llvm.ad as llvm
@@ -23,10 +24,10 @@ import numpy as np
 from skimage.measure import marching_cubes
 
 from gshell_mi.extraction import extract
-from gshell_mi.lattice import TetLattice
+from gshell_mi.lattice import GRIDS, Lattice, make_lattice
 
 
-def shirt(lattice: TetLattice) -> tuple[np.ndarray, np.ndarray]:
+def shirt(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
     """Signed distance (approximate) of a shirt-like solid and the mSDF that opens its four ends."""
     p = lattice.points(llvm.Float)
     x, y, z = dr.abs(p.x), p.y, p.z
@@ -51,9 +52,9 @@ def seconds(action: Callable[[], float], best: dict[str, float], name: str) -> N
     best[name] = min(best.get(name, np.inf), action())
 
 
-def run(resolution: int, repeats: int) -> dict[str, float]:
+def run(resolution: int, grids: list[str], repeats: int) -> dict[str, float]:
     """Least times in seconds by name."""
-    lattice = TetLattice(resolution)
+    lattice = make_lattice("tet", resolution)  # all kinds have the same vertices
     sdf, msdf = shirt(lattice)
     deform = np.random.default_rng(0).uniform(-0.5, 0.5, 3 * lattice.vertex_count).astype(np.float32)
     volume = sdf.reshape((lattice.stride,) * 3)
@@ -64,14 +65,14 @@ def run(resolution: int, repeats: int) -> dict[str, float]:
         marching_cubes(field, 0.0)
         return time.perf_counter() - start
 
-    def ours(arrays: tuple[np.ndarray, ...], backward: bool) -> float:
+    def ours(grid: str, arrays: tuple[np.ndarray, ...], backward: bool) -> float:
         fields = [llvm.Float(a) for a in arrays]
         if backward:
             dr.enable_grad(fields)
         dr.eval(fields)
         dr.sync_thread()
         start = time.perf_counter()
-        mesh = extract(lattice, *fields)
+        mesh = extract(make_lattice(grid, resolution), *fields)
         if backward:
             dr.backward(dr.sum(dr.squared_norm(mesh.vertices)) + dr.sum(mesh.msdf))
             dr.eval([dr.grad(f) for f in fields])
@@ -81,12 +82,16 @@ def run(resolution: int, repeats: int) -> dict[str, float]:
     best: dict[str, float] = {}
     for _ in range(repeats):
         seconds(scikit_image, best, "marching cubes")
-        for label, arrays in (("sdf, msdf", (sdf, msdf)), ("sdf, msdf, deform", (sdf, msdf, deform))):
-            seconds(lambda a=arrays: ours(a, False), best, f"{label}: forward")
-            seconds(lambda a=arrays: ours(a, True), best, f"{label}: forward + backward")
-    mesh = extract(lattice, llvm.Float(sdf), llvm.Float(msdf))
+        for grid in grids:
+            for label, arrays in (("sdf, msdf", (sdf, msdf)), ("sdf, msdf, deform", (sdf, msdf, deform))):
+                for what, backward in (("forward", False), ("forward + backward", True)):
+                    action = partial(ours, grid, arrays, backward)
+                    seconds(action, best, f"{grid}: {label}: {what}")
     cubes = marching_cubes(volume, 0.0)[1]
-    print(f"\n{resolution}^3 cells: {mesh.face_count} triangles cut; marching cubes has {len(cubes)}")
+    print(f"\n{resolution}^3 cells: marching cubes has {len(cubes)} triangles")
+    for grid in grids:
+        mesh = extract(make_lattice(grid, resolution), llvm.Float(sdf), llvm.Float(msdf))
+        print(f"  {grid}: {mesh.face_count} triangles cut, {mesh.vertex_count} vertices")
     for name, value in best.items():
         print(f"  {name:40s} {value * 1e3:8.2f} ms   ratio {value / best['marching cubes']:5.2f}")
     return best
@@ -97,12 +102,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--resolutions", type=int, nargs="+", default=[64, 128, 256], help="cells per side")
+    parser.add_argument("--grids", nargs="+", default=list(GRIDS), choices=GRIDS, help="kinds of lattices")
     parser.add_argument("--repeats", type=int, default=7, help="runs of which the fastest counts")
     arguments = parser.parse_args()
     dr.set_thread_count(1)  # the calling thread is that one: there are no workers
     print(f"Dr.Jit {dr.__version__}, threads: {dr.thread_count()}")
     for resolution in arguments.resolutions:
-        run(resolution, arguments.repeats)
+        run(resolution, arguments.grids, arguments.repeats)
 
 
 if __name__ == "__main__":

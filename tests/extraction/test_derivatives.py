@@ -21,7 +21,7 @@ def _fields(lattice) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(3)
     p = lattice.vertex_positions()
     sdf = np.linalg.norm(p, axis=1) - 0.62 + rng.uniform(-0.03, 0.03, len(p))
-    msdf = 0.21 - p[:, 2] + 0.4 * p[:, 0] + rng.uniform(-0.05, 0.05, len(p))
+    msdf = 0.23 - p[:, 2] + 0.4 * p[:, 0] + rng.uniform(-0.05, 0.05, len(p))
     for field in (sdf, msdf):
         field += np.where(np.abs(field) < 0.02, np.sign(field) * 0.02, 0)
     return {"sdf": sdf, "msdf": msdf, "deform": rng.uniform(-0.9, 0.9, 3 * len(p))}
