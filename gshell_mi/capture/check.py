@@ -87,14 +87,15 @@ class _Sheet:
         self.center, self.half = to_world[:3, 3], np.abs(to_world[:3, :3]).sum(axis=1).max()
         views = PinholeViews.from_sensors(scene.sensors)
         self.cameras = [camera_of(sensor, views, i) for i, sensor in enumerate(scene.sensors)]
-        photographs = read_record(scene.path.with_suffix(""))
+        record = read_record(scene.path.with_suffix(""))
         self.thumbnails = []
         for sensor, target, camera in zip(scene.sensors, scene.targets, self.cameras, strict=True):
-            image, clipped = photographs.get(sensor.id(), (None, 0.0))
+            image, clipped = record.photographs.get(sensor.id(), (None, 0.0))
             name = f"{sensor.id()} ({Path(image).name})" if image else sensor.id()
             self.thumbnails.append(Thumbnail.of(name, target.rgba, camera, clipped))
         box = np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
-        self.warnings = find_trouble(self.thumbnails, box, has_alpha=all(t.has_alpha for t in scene.targets))
+        self.warnings = find_trouble(self.thumbnails, box, record.to_scene,
+                                     has_alpha=all(target.has_alpha for target in scene.targets))
         self.hull = _hull(scene, [thumbnail.silhouette for thumbnail in self.thumbnails])
         if self.hull is None:
             self.warnings.append("The masks have no common volume in the box: a fit of this scene will "

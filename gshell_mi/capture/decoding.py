@@ -18,6 +18,8 @@ from ..errors import UserError
 FLOAT_SUFFIXES = (".exr", ".hdr", ".pfm")
 #: In the order in which they are tried for a name without a suffix.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".tga", ".hdr", ".pfm")
+#: Cameras' own formats; of others, a PNG has to be read to its end to find EXIF data.
+_EXIF_SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 
 _REC709 = "ITU-R BT.709"
 
@@ -171,22 +173,22 @@ class ColorDecoding:
 def _known(name: str, names: object, option: str, what: str) -> None:
     if name not in names:
         near = difflib.get_close_matches(name, list(names), n=1, cutoff=0.3) or sorted(names)[:1]
-        raise UserError(f"{option} '{name}' is no {what} that colour-science knows; did you mean "
-                        f"'{near[0]}'?")
+        raise UserError(f"{option} '{name}' is no {what} that colour-science knows; the nearest that it "
+                        f"knows is '{near[0]}'.")
 
 
 def exif_exposure(path: Path) -> float | None:
     """Exposure of a photograph in stops above 1 s at f/1 and ISO 100; None if its EXIF data do not tell."""
-    if path.suffix.lower() in FLOAT_SUFFIXES:
+    if path.suffix.lower() not in _EXIF_SUFFIXES:
         return None
-    with Image.open(path) as image:
-        tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
     try:
+        with Image.open(path) as image:
+            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
         seconds = float(tags[ExifTags.Base.ExposureTime])
         aperture = float(tags[ExifTags.Base.FNumber])
         sensitivity = tags[ExifTags.Base.ISOSpeedRatings]
         iso = float(sensitivity[0] if isinstance(sensitivity, tuple) else sensitivity)
         exposure = float(np.log2(seconds * iso / 100 / aperture**2))
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        return None
+    except (KeyError, OSError, SyntaxError, TypeError, ValueError, ZeroDivisionError):
+        return None    # reading the pixels will complain of a broken file
     return exposure if np.isfinite(exposure) else None

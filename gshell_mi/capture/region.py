@@ -170,28 +170,34 @@ def agreement(silhouettes: list[Silhouette], box: np.ndarray, rays: int = 32) ->
     return np.where([s.is_empty for s in silhouettes], 1.0, share)
 
 
-#: Ways to misread a pose, as functions of the camera-to-world matrix with axes right, down, forward.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-MISREADINGS = {
-    "their y and z axes point the other way (OpenCV's and OpenGL's conventions are mixed up)":
-        lambda pose: pose @ _FLIP,
-    "their matrices are world-to-camera instead of camera-to-world":
-        lambda pose: np.linalg.inv(pose),
-    "their matrices are world-to-camera instead of camera-to-world, and their y and z axes flipped":
-        lambda pose: np.linalg.inv(pose @ _FLIP),
-    "their matrices are world-to-camera instead of camera-to-world, of OpenGL's axes":
-        lambda pose: np.linalg.inv(pose @ _FLIP) @ _FLIP,
-    "their images are upside down":
-        lambda pose: pose @ np.diag([-1.0, -1.0, 1.0, 1.0]),
-}
+#: The misreading that the importer has an option for.
+FLIPPED_AXES = "their y and z axes point the other way (OpenCV's and OpenGL's conventions are mixed up)"
+_INVERSE = "their matrices are world-to-camera where camera-to-world is expected"
+#: Ways to misread a pose: what would be the case, and how the camera-to-world matrix has to change.
+_MISREADINGS = (
+    (FLIPPED_AXES, lambda pose: pose @ _FLIP),
+    (_INVERSE, lambda pose: np.linalg.inv(pose @ _FLIP) @ _FLIP),
+    (_INVERSE, np.linalg.inv),
+    (f"{_INVERSE}, and {FLIPPED_AXES}", lambda pose: np.linalg.inv(pose @ _FLIP)),
+    ("their images are upside down", lambda pose: pose @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+)
 
 
-def likely_misreading(silhouettes: list[Silhouette], limit: int = 40) -> str | None:
-    """The misreading of the cameras under which their masks agree, if there is one."""
+def likely_misreading(silhouettes: list[Silhouette], to_scene: np.ndarray, limit: int = 40) -> str | None:
+    """The misreading of the cameras under which their masks agree, if there is one.
+
+    Args:
+        to_scene: (4, 4) how the world was turned after the cameras had been read.
+        limit: of the number of views that are tried.
+    """
     some = silhouettes[::max(len(silhouettes) // limit, 1)]
+    to_capture = np.linalg.inv(to_scene)
     best, name = 0.9, None
-    for candidate, reread in MISREADINGS.items():
-        changed = [replace(s, camera=replace(s.camera, to_world=reread(s.camera.to_world))) for s in some]
+    for candidate, reread in _MISREADINGS:
+        poses = [reread(to_capture @ s.camera.to_world) for s in some]
+        changed = [replace(s, camera=replace(s.camera, to_world=pose))
+                   for s, pose in zip(some, poses, strict=True)]
         box = find_box(changed)
         if box is not None and (score := float(agreement(changed, box).mean())) > best:
             best, name = score, candidate

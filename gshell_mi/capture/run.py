@@ -19,7 +19,7 @@ from .formats import read_capture
 from .frames import Capture, Frame
 from .masks import Background, assign_masks
 from .prepare import Preparation, exposure_gains
-from .region import find_box, likely_misreading
+from .region import FLIPPED_AXES, find_box, likely_misreading
 from .trouble import Thumbnail, find_trouble
 from .writer import scene_xml, sensors_xml, staged, write_record, write_target
 
@@ -120,7 +120,7 @@ class _Import:
             self.warnings.append(f"{len(empty)} views with empty masks are left out: {', '.join(empty[:3])}"
                                  f"{' ...' if len(empty) > 3 else ''}.")
         box = self._box(thumbnails)
-        self.warnings += find_trouble(thumbnails, box)
+        self.warnings += find_trouble(thumbnails, box, self.to_scene)
         (folder / "sensors.xml").write_text(sensors_xml(cameras, box), encoding="utf-8")
         if tests:
             (folder / "test.xml").write_text(sensors_xml(tests, box), encoding="utf-8")
@@ -143,8 +143,8 @@ class _Import:
                                center + np.ptp(region, axis=0).max() / 2])
         box = find_box(silhouettes, region)
         if box is None:
-            misreading = likely_misreading(silhouettes)
-            if misreading and "OpenCV" in misreading:
+            misreading = likely_misreading(silhouettes, self.to_scene)
+            if misreading == FLIPPED_AXES:
                 other = "leave out" if self.config.opencv_axes else "try"
                 cure = f"the cameras look misread, as the masks agree if {misreading}: {other} --opencv-axes"
             elif misreading:

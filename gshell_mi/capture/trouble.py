@@ -45,10 +45,12 @@ class Thumbnail:
         return Silhouette(self.camera, self.rgba[..., 3])
 
 
-def find_trouble(thumbnails: list[Thumbnail], box: np.ndarray, *, has_alpha: bool = True) -> list[str]:
+def find_trouble(thumbnails: list[Thumbnail], box: np.ndarray, to_scene: np.ndarray, *,
+                 has_alpha: bool = True) -> list[str]:
     """Sentences that name what is likely wrong with training views and the box (2, 3); often none.
 
     Args:
+        to_scene: (4, 4) how an import turned the world after it had read the cameras.
         has_alpha: False if the targets came without coverage, which cannot be judged then.
     """
     found = []
@@ -71,7 +73,7 @@ def find_trouble(thumbnails: list[Thumbnail], box: np.ndarray, *, has_alpha: boo
         found.append(f"The masks of {_names(full)} cover the whole image, so they say nothing of the "
                      "outline.")
     if seen:
-        found += _geometry(seen, box)
+        found += _geometry(seen, box, to_scene)
     return found
 
 
@@ -105,7 +107,7 @@ def _is_flat(rgba: np.ndarray) -> bool:
     return len(rgb) > 0 and bool(srgb(rgb / max(rgb.max(), 1e-6)).std(axis=0).max() < _ONE_COLOR)
 
 
-def _geometry(seen: list[Thumbnail], box: np.ndarray) -> list[str]:
+def _geometry(seen: list[Thumbnail], box: np.ndarray, to_scene: np.ndarray) -> list[str]:
     found = []
     silhouettes = [t.silhouette for t in seen]
     missed = np.array([_share_outside(s, box) for s in silhouettes])
@@ -115,7 +117,7 @@ def _geometry(seen: list[Thumbnail], box: np.ndarray) -> list[str]:
         found.append(f"The box misses the object: {100 * missed.mean():.0f} % of the masks lie beside it "
                      f"({100 * missed[worst]:.0f} % in {seen[worst].name}); enlarge or move it with --box.")
     elif agreeing.mean() < 0.9:
-        misreading = likely_misreading(silhouettes)
+        misreading = likely_misreading(silhouettes, to_scene)
         if misreading:
             found.append(f"The cameras look misread: the masks agree only if {misreading}.")
         else:

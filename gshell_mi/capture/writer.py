@@ -9,6 +9,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -101,16 +102,27 @@ def write_record(folder: Path, record: dict) -> None:
     (folder / RECORD).write_text(text, encoding="utf-8", errors="surrogateescape")
 
 
-def read_record(folder: Path) -> dict[str, tuple[str, float]]:
-    """By sensor id the photograph that an import made the target of, and the share that it had clipped.
+@dataclass(frozen=True)
+class Record:
+    """What an import noted of a scene; nothing, if no import wrote it.
 
-    Empty if no import wrote the folder.
+    Attributes:
+        photographs: by sensor id the file and the share of the object that it had clipped.
+        to_scene: (4, 4) how the capture's world was turned.
     """
+
+    photographs: dict[str, tuple[str, float]] = field(default_factory=dict)
+    to_scene: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+
+def read_record(folder: Path) -> Record:
+    """The record in the folder of a scene's targets."""
     try:
-        views = json.loads((folder / RECORD).read_text(encoding="utf-8", errors="surrogateescape"))["views"]
-        return {view["id"]: (view["image"], float(view["clipped"])) for view in views}
+        stored = json.loads((folder / RECORD).read_text(encoding="utf-8", errors="surrogateescape"))
+        photographs = {view["id"]: (view["image"], float(view["clipped"])) for view in stored["views"]}
+        return Record(photographs, np.array(stored["capture_to_scene"], dtype=np.float64).reshape(4, 4))
     except (OSError, ValueError, KeyError, TypeError):
-        return {}
+        return Record()
 
 
 @contextmanager

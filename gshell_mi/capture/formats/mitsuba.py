@@ -48,7 +48,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
         sensors = mi.load_file(str(path)).sensors()
     except Exception as error:
         reason = (str(error).strip().splitlines() or [repr(error)])[0]
-        raise UserError(f"'{path}' cannot be loaded by Mitsuba: {reason}") from error
+        raise UserError(f"'{path}' cannot be loaded by Mitsuba ({reason}); correct the file.") from error
     if not sensors:
         raise UserError(f"'{path}' has no sensors; add one per image, with the image's name as its id.")
     folders = [images] if images else [path.parent, path.parent / "images"]
