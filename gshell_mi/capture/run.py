@@ -117,8 +117,9 @@ class _Import:
             raise UserError(f"The masks of all images of '{self.capture.source}' are empty; masks are white, "
                             f"and alpha is 1, on the object.")
         if empty:
-            self.warnings.append(f"{len(empty)} views with empty masks are left out: {', '.join(empty[:3])}"
-                                 f"{' ...' if len(empty) > 3 else ''}.")
+            some = ", ".join(empty[:3]) + (" ..." if len(empty) > 3 else "")
+            what = "view with an empty mask is" if len(empty) == 1 else "views with empty masks are"
+            self.warnings.append(f"{len(empty)} {what} left out: {some}.")
         box = self._box(thumbnails)
         self.warnings += find_trouble(thumbnails, box, self.to_scene)
         (folder / "sensors.xml").write_text(sensors_xml(cameras, box), encoding="utf-8")
