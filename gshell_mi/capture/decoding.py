@@ -6,6 +6,7 @@ import difflib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 
 import mitsuba as mi
 import numpy as np
@@ -133,8 +134,7 @@ class ColorDecoding:
     transfer: str | None = None
 
     def __post_init__(self):
-        import colour
-
+        colour = _colour_science()
         _known(self.color_space, colour.RGB_COLOURSPACES, "--color-space", "colour space")
         if self.transfer not in (None, "linear"):
             _known(self.transfer, colour.CCTF_DECODINGS, "--transfer", "transfer function")
@@ -152,8 +152,7 @@ class ColorDecoding:
         return np.maximum(linear, 0.0)
 
     def _decode(self, values: np.ndarray, *, integer: bool) -> np.ndarray:
-        import colour
-
+        colour = _colour_science()
         if self.transfer == "linear" or (self.transfer is None and not integer):
             return values
         if self.transfer is None:
@@ -163,11 +162,17 @@ class ColorDecoding:
     @cached_property
     def _to_rec709(self) -> np.ndarray | None:
         """Of row vectors."""
-        import colour
-
+        colour = _colour_science()
         matrix = colour.matrix_RGB_to_RGB(colour.RGB_COLOURSPACES[self.color_space],
                                           colour.RGB_COLOURSPACES[_REC709])
         return None if np.allclose(matrix, np.eye(3), atol=1e-3) else matrix.T.astype(np.float32)
+
+
+def _colour_science() -> ModuleType:
+    """Imported when first needed, as that takes a second; it changes how NumPy prints, which is undone."""
+    with np.printoptions():
+        import colour
+    return colour
 
 
 def _known(name: str, names: object, option: str, what: str) -> None:

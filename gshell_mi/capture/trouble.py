@@ -8,7 +8,7 @@ import numpy as np
 
 from ..images import srgb
 from .camera import Camera
-from .region import MASK_SIZE, Silhouette, agreement, likely_misreading
+from .region import MASK_SIZE, Silhouette, agreement, find_box, likely_misreading
 from .resample import shrink
 
 #: Fewer views leave a visual hull of few, large facets.
@@ -111,25 +111,33 @@ def _geometry(seen: list[Thumbnail], box: np.ndarray, to_scene: np.ndarray) -> l
     found = []
     silhouettes = [t.silhouette for t in seen]
     missed = np.array([_share_outside(s, box) for s in silhouettes])
-    agreeing = agreement(silhouettes, box)
-    if missed.mean() > 0.01:
+    if missed.mean() > 0.01 and (own := find_box(silhouettes)) is not None:
+        agreeing = agreement(silhouettes, own)
+    else:
+        own, agreeing = None, agreement(silhouettes, box)
+    if agreeing.mean() < 0.9:
+        found.append(_disagreement(seen, agreeing, to_scene))
+    elif own is not None:
         worst = int(missed.argmax())
+        low, high = (" ".join(f"{value:.3g}" for value in corner) for corner in own)
         found.append(f"The box misses the object: {100 * missed.mean():.0f} % of the masks lie beside it "
-                     f"({100 * missed[worst]:.0f} % in {seen[worst].name}); enlarge or move it with --box.")
-    elif agreeing.mean() < 0.9:
-        misreading = likely_misreading(silhouettes, to_scene)
-        if misreading:
-            found.append(f"The cameras look misread: the masks agree only if {misreading}.")
-        else:
-            bad = [t for t, share in zip(seen, agreeing, strict=True) if share < 0.7]
-            found.append(f"The masks do not agree on a common volume ({100 * agreeing.mean():.0f} % of their "
-                         f"pixels do){': worst are ' + _names(bad) if bad else ''}; check the cameras' "
-                         f"convention, the masks and the order of the images.")
+                     f"({100 * missed[worst]:.0f} % in {seen[worst].name}); --box {low} {high} would hold "
+                     "it.")
     directions = np.stack([s.camera.center - box.mean(axis=0) for s in silhouettes])
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
     if np.linalg.norm(directions.mean(axis=0)) > 0.8:
         found.append("All views look from one side; what they do not see is not reconstructed.")
     return found
+
+
+def _disagreement(seen: list[Thumbnail], agreeing: np.ndarray, to_scene: np.ndarray) -> str:
+    misreading = likely_misreading([t.silhouette for t in seen], to_scene)
+    if misreading:
+        return f"The cameras look misread: the masks agree only if {misreading}."
+    bad = [t for t, share in zip(seen, agreeing, strict=True) if share < 0.7]
+    return (f"The masks do not agree on a common volume ({100 * agreeing.mean():.0f} % of their pixels do)"
+            f"{': worst are ' + _names(bad) if bad else ''}; check the cameras' convention, the masks and "
+            f"the order of the images.")
 
 
 def _share_outside(silhouette: Silhouette, box: np.ndarray) -> float:
