@@ -42,6 +42,11 @@ class Lattice:
     grid: ClassVar[str] = ""
     """Name of the kind of lattice, the shape plugin's parameter ``grid``."""
 
+    @property
+    def weight_count(self) -> int:
+        """Values of the field ``weights``, which only FlexiCubes have."""
+        return 0
+
     resolution: int
 
     def __post_init__(self):
@@ -102,6 +107,14 @@ class Lattice:
             dr.fma(float_t(z), cell, -1),
         )
 
+    def offset_positions(self, vertex: Any, deform: Any, float_t: type) -> Any:
+        """Positions of the vertices with the ids ``vertex``, offset by ``deform`` unless that is None."""
+        p = self.positions_of(vertex, float_t)
+        if deform is None:
+            return p
+        offset = dr.gather(type(p), deform, vertex, mode=dr.ReduceMode.Local)
+        return dr.fma(dr.clip(offset, -1, 1), dr.opaque(float_t, self.max_offset), p)
+
 
 @dataclass(frozen=True)
 class TetLattice(Lattice):
@@ -124,7 +137,25 @@ class CubeLattice(Lattice):
     grid: ClassVar[str] = "cube"
 
 
-_KINDS: dict[str, type[Lattice]] = {kind.grid: kind for kind in (TetLattice, CubeLattice)}
+@dataclass(frozen=True)
+class FlexiCubesLattice(Lattice):
+    """Cubes with a vertex inside (``flexicubes``): dual marching cubes with weights per cube.
+
+    The vertices on its border count as outside, so the template is always closed.
+    """
+
+    grid: ClassVar[str] = "flexicubes"
+
+    @property
+    def weight_count(self) -> int:
+        """21 per cube: alpha of its corners, beta of its edges (``extraction.cube_tables.EDGES``), gamma.
+
+        Cube (x, y, z) is number ``x + y N + z N^2``, N = ``resolution``.
+        """
+        return 21 * self.resolution**3
+
+
+_KINDS: dict[str, type[Lattice]] = {kind.grid: kind for kind in (TetLattice, CubeLattice, FlexiCubesLattice)}
 
 #: Names of the kinds of lattices.
 GRIDS: tuple[str, ...] = tuple(_KINDS)

@@ -14,7 +14,7 @@ from .extraction.surface_mesh import gather
 from .fields import LatticeFields, from_mesh, sphere
 from .lattice import make_lattice
 
-_FIELDS = ("sdf", "msdf", "deform")
+_FIELDS = ("sdf", "msdf", "deform", "weights")
 _LATTICE_PREFIX = "lattice_"
 
 
@@ -23,7 +23,7 @@ class GShell(mi.Mesh):
 
     ======================  =================================================================
     ``resolution``          integer: cells per side of the lattice (default: that of the file, or 64)
-    ``grid``                string: ``tet`` (default) or ``cube``, see ``lattice``
+    ``grid``                string: ``tet`` (default), ``cube`` or ``flexicubes``, see ``lattice``
     ``to_world``            transform: maps the lattice's cube [-1, 1]^3 to the world
     ``filename``            string: initial fields: an .npz with ``sdf`` and, if wanted, ``msdf`` and
                             ``deform``, or a mesh file in world space (default: a sphere of radius 0.5
@@ -38,6 +38,7 @@ class GShell(mi.Mesh):
     ``sdf``, ``msdf``       one value per lattice vertex, in lattice units
     ``deform``              three values per lattice vertex; 1 is the greatest offset that rules out
                             self-intersection, beyond it they are clipped
+    ``weights``             with ``flexicubes`` only: 21 values per cube, 0 is neutral, see ``extract``
     ``lattice_<name>``      the lattice field of the mesh attribute ``<name>``, after
                             ``attach_attribute``
     ======================  =================================================================
@@ -80,7 +81,7 @@ class GShell(mi.Mesh):
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         differentiable = mi.ParamFlags.Differentiable
-        for name in _FIELDS:
+        for name in self.field_names:
             callback.put(name, getattr(self, name), differentiable | mi.ParamFlags.Discontinuous)
         for name, (field, _) in self._attributes.items():
             callback.put(_LATTICE_PREFIX + name, field, differentiable)
@@ -131,20 +132,27 @@ class GShell(mi.Mesh):
             self.remove_attribute(name)
         self._attributes = {}
         self.lattice = fields.lattice
-        self.sdf, self.msdf, self.deform = (mi.Float(getattr(fields, name)) for name in _FIELDS)
+        self.sdf, self.msdf, self.deform = (mi.Float(getattr(fields, name)) for name in _FIELDS[:3])
+        weights = fields.weights
+        self.weights = dr.zeros(mi.Float, self.lattice.weight_count) if weights is None else mi.Float(weights)
         self._extract()
 
     def fields(self) -> LatticeFields:
         """A copy of the present fields on the host."""
-        arrays = (np.array(dr.detach(getattr(self, name))) for name in _FIELDS)
-        return LatticeFields(*arrays, self.lattice.grid)
+        arrays = {name: np.array(dr.detach(getattr(self, name))) for name in self.field_names}
+        return LatticeFields(grid=self.lattice.grid, **arrays)
 
     def template(self) -> SurfaceMesh:
         """The watertight template of the present fields, in world space."""
-        return self._in_world(extract(self.lattice, *self._fields(), template=True).template)
+        return self._in_world(extract(self.lattice, **self._fields(), template=True).template)
 
-    def _fields(self) -> tuple[Any, Any, Any]:
-        return self.sdf, self.msdf, self.deform
+    @property
+    def field_names(self) -> tuple[str, ...]:
+        """The parameters that make the surface: ``weights`` are among them with FlexiCubes only."""
+        return _FIELDS if self.lattice.weight_count else _FIELDS[:3]
+
+    def _fields(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.field_names}
 
     def _in_world(self, surface: SurfaceMesh) -> SurfaceMesh:
         if surface.is_empty:
@@ -155,7 +163,7 @@ class GShell(mi.Mesh):
         return replace(surface, vertices=type(surface.vertices)(p), faces=faces)
 
     def _extract(self) -> None:
-        self.surface = self._in_world(extract(self.lattice, *self._fields()))
+        self.surface = self._in_world(extract(self.lattice, **self._fields()))
         self._write()
 
     def _write(self) -> None:

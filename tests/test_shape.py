@@ -342,3 +342,17 @@ for variant in ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_mono"):
     assert abs(hit.t[0] - 3.5) < 0.1 and isinstance(scene.shapes()[0], mi.Mesh)
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_weights_are_a_parameter_of_flexicubes_alone():
+    assert "subject.weights" not in mi.traverse(_scene(grid="cube"))
+    scene = _scene(grid="flexicubes", resolution=8)
+    params, subject = mi.traverse(scene), _subject(scene)
+    before = subject.surface.to_numpy()[0]
+    weights = np.random.default_rng(0).normal(size=21 * 8**3).astype(np.float32)
+    params["subject.weights"] = mi.Float(weights)
+    params.update()
+    moved = np.abs(subject.surface.to_numpy()[0] - before).max()
+    assert 0.01 < moved < subject.lattice.spacing
+    np.testing.assert_array_equal(subject.fields().weights, weights)
+    assert subject.template().vertex_count == subject.surface.vertex_count

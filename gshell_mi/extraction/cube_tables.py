@@ -188,7 +188,10 @@ def cube_around_edge(edge: Edge) -> int:
     return (corner >> (axis + 1) % 3 & 1) | (corner >> (axis + 2) % 3 & 1) << 1
 
 
-# Packed tables. A polygon's entry is its number among those of its cube (at most 4) + 4 * signs.
+# Packed tables. ``case`` is ``signs``, + 256 if the inside corners of the twice visited face are joined. A
+# polygon's entry is 4 * case + its number among those of its cube.
+
+CASES = 512
 
 
 def _pack(values: list[int], bits: int) -> int:
@@ -196,32 +199,56 @@ def _pack(values: list[int], bits: int) -> int:
 
 
 @cache
-def polygon_keys() -> list[tuple[int, Polygon]]:
+def _case_polygons() -> list[list[Polygon]]:
+    split = [cube_polygons(signs, twice_visited_face(signs)) for signs in range(256)]
+    return [*(cube_polygons(signs) for signs in range(256)), *split]
+
+
+def polygon_entries() -> list[tuple[int, Polygon]]:
     """All polygons with their entries."""
-    return [(4 * signs + i, p) for signs in range(256) for i, p in enumerate(cube_polygons(signs))]
+    return [(4 * case + i, p) for case, found in enumerate(_case_polygons()) for i, p in enumerate(found)]
 
 
 @cache
 def polygon_mask_table() -> np.ndarray:
-    """``[signs]``: bit i tells that the cube has a polygon i."""
-    return np.array([(1 << len(cube_polygons(signs))) - 1 for signs in range(256)], np.uint32)
+    """``[case]``: bit i tells that the cube has a polygon i."""
+    return np.array([(1 << len(polygons)) - 1 for polygons in _case_polygons()], np.uint32)
 
 
 @cache
 def edge_table() -> np.ndarray:
     """``[8 * entry + i]``: edge of vertex i as corner << 3 | difference of its ends; 0 past the last."""
-    table = np.zeros((1024, 8), np.uint32)
-    for entry, polygon in polygon_keys():
+    table = np.zeros((4 * CASES, 8), np.uint32)
+    for entry, polygon in polygon_entries():
         table[entry, : len(polygon.edges)] = [corner << 3 | 1 << axis for corner, axis in polygon.edges]
     return table.ravel()
+
+
+@cache
+def around_table() -> np.ndarray:
+    """``[8 * entry + i]``: number of the cube around the edge of vertex i (bits 0-1) and of the edge in the
+    cube, as in ``EDGES`` (bits 2-5)."""
+    table = np.zeros((4 * CASES, 8), np.uint32)
+    for entry, polygon in polygon_entries():
+        table[entry, : len(polygon.edges)] = [
+            cube_around_edge(edge) | EDGES.index(edge) << 2 for edge in polygon.edges
+        ]
+    return table.ravel()
+
+
+@cache
+def twice_visited_face_table() -> np.ndarray:
+    """``[signs]``: ``twice_visited_face``, 7 for none."""
+    faces = [twice_visited_face(signs) for signs in range(256)]
+    return np.array([7 if face is None else face for face in faces], np.uint32)
 
 
 @cache
 def side_table() -> np.ndarray:
     """``[8 * entry + i]``: the side after vertex i. Bits 0-1 and 2-3: the number of its face around the
     edges of its first and its second vertex; bits 4-6: the second vertex."""
-    table = np.zeros((1024, 8), np.uint32)
-    for entry, polygon in polygon_keys():
+    table = np.zeros((4 * CASES, 8), np.uint32)
+    for entry, polygon in polygon_entries():
         for i, (edge, face) in enumerate(zip(polygon.edges, polygon.faces, strict=True)):
             j = (i + 1) % len(polygon.edges)
             around = [faces_around_edge(edge, face), faces_around_edge(polygon.edges[j], face)]
@@ -237,11 +264,11 @@ def clip_tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         ``[entry]``: where the polygon's rows begin; ``[begin + kept]``: first << 3 | number of triangles;
         and the triangles, three local points of 4 bits each. Polygons of the same shape share their rows.
     """
-    begins = np.zeros(1024, np.uint32)
+    begins = np.zeros(4 * CASES, np.uint32)
     begin_of_shape: dict[tuple, int] = {}
     rows: list[int] = []
     triangles: list[int] = []
-    for entry, polygon in polygon_keys():
+    for entry, polygon in polygon_entries():
         size = range(len(polygon.edges))
         middles = [edge_middle(edge) for edge in polygon.edges]
         distances = [float(np.sum((middles[i] - middles[j]) ** 2)) for i in size for j in size]

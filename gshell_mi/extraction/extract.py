@@ -5,8 +5,9 @@ from typing import Any
 import drjit as dr
 
 from ..errors import UserError
-from ..lattice import CubeLattice, Lattice, TetLattice
+from ..lattice import CubeLattice, FlexiCubesLattice, Lattice, TetLattice
 from .cubes import CubeExtraction
+from .flexicubes import FlexiCubesExtraction
 from .grid_extraction import GridExtraction
 from .surface_mesh import SurfaceMesh
 from .tetrahedra import TetExtraction
@@ -14,11 +15,18 @@ from .tetrahedra import TetExtraction
 _ALGORITHMS: dict[type[Lattice], type[GridExtraction]] = {
     TetLattice: TetExtraction,
     CubeLattice: CubeExtraction,
+    FlexiCubesLattice: FlexiCubesExtraction,
 }
 
 
 def extract(
-    lattice: Lattice, sdf: Any, msdf: Any = None, deform: Any = None, *, template: bool = False
+    lattice: Lattice,
+    sdf: Any,
+    msdf: Any = None,
+    deform: Any = None,
+    *,
+    weights: Any = None,
+    template: bool = False,
 ) -> SurfaceMesh:
     """The surface ``{sdf = 0, msdf >= 0}`` as a triangle mesh, differentiable in all three fields.
 
@@ -26,7 +34,7 @@ def extract(
     lattice vertex (or is exactly 0 there) the mesh vertex is kept a small fraction of the edge away, so
     that no triangle degenerates; derivatives are those of the formula at the shifted point. The surface
     ends in an open boundary where it leaves the lattice: a field that is positive on the border of the
-    lattice has a watertight template.
+    lattice has a watertight template. (In FlexiCubes the border counts as outside.)
 
     Args:
         lattice: the lattice of n vertices; its docstring gives their order.
@@ -35,6 +43,8 @@ def extract(
         msdf: manifold signed distance (n values); None keeps the whole template.
         deform: offsets of the lattice vertices as ``Array3f`` of n or flat ``Float`` of 3 n values
             (x0, y0, z0, x1, ...), clipped to [-1, 1], where 1 is ``lattice.max_offset``; None for none.
+        weights: for a ``FlexiCubesLattice``, 21 values per cube (``weight_count``). Any real number
+            w stands for the positive weight 1 + 0.9 tanh(w); None for 0, which is neutral.
         template: also return the watertight template as ``SurfaceMesh.template``.
 
     Raises:
@@ -55,7 +65,13 @@ def extract(
         msdf = _checked("msdf", msdf, lattice.vertex_count)
     if deform is not None:
         deform = _checked("deform", deform, 3 * lattice.vertex_count)
-    return _ALGORITHMS[type(lattice)](lattice, type(sdf)).run(sdf, msdf, deform, template)
+    if weights is not None:
+        if not lattice.weight_count:
+            raise UserError(
+                f"weights belong to the grid 'flexicubes', not to '{lattice.grid}'; leave them out"
+            )
+        weights = _checked("weights", weights, lattice.weight_count)
+    return _ALGORITHMS[type(lattice)](lattice, type(sdf)).run(sdf, msdf, deform, template, weights)
 
 
 def _checked(name: str, field: Any, count: int) -> Any:

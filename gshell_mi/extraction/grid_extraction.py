@@ -62,7 +62,7 @@ class GridExtraction(ABC):
         self.margin = dr.opaque(float_t, (16 * 2.0**-24 / lattice.spacing) ** 0.5)
 
     @abstractmethod
-    def run(self, sdf: Any, msdf: Any, deform: Any, with_template: bool) -> SurfaceMesh:
+    def run(self, sdf: Any, msdf: Any, deform: Any, with_template: bool, weights: Any) -> SurfaceMesh:
         """The mesh of flat fields that ``extract`` has checked."""
 
     # Edges --------------------------------------------------------------------------------------------
@@ -147,28 +147,35 @@ class GridExtraction(ABC):
         # Halved, as the sum of two finite numbers may overflow.
         return 0.5 * m0 / (0.5 * m0 + 0.5 * m1)
 
+    def kept_and_dropped(self, points: Any, msdf: Any) -> tuple[Any, Any]:
+        """Indices of the points where the mSDF is not negative, and of the others."""
+        positive = points.interpolate(dr.detach(msdf)) >= NEGATIVE
+        return dr.compress(positive), dr.compress(~positive)
+
+    def kept_first(self, kept: Any, dropped: Any) -> Any:
+        """New numbers of the vertices, kept ones first, as the open surface and its template share them."""
+        kept_count = dr.width(kept)
+        order = dr.empty(self.uint_t, kept_count + dr.width(dropped))
+        dr.scatter(order, dr.arange(self.uint_t, kept_count), kept, mode=dr.ReduceMode.Permute)
+        rest = dr.arange(self.uint_t, dr.width(dropped)) + dr.opaque(self.uint_t, kept_count)
+        dr.scatter(order, rest, dropped, mode=dr.ReduceMode.Permute)
+        return order
+
     def edge_points(self, sdf: Any, a: Any, b: Any) -> EdgePoints:
         s_a, s_b = gather(self.float_t, sdf, a), gather(self.float_t, sdf, b)
         return EdgePoints(a, b, self.zero_crossing(s_a, s_b))
 
     def mesh(self, blocks: tuple, faces: Any, msdf: Any, deform: Any, kept_count: int) -> SurfaceMesh:
-        def position(vertex):
-            p = self.lattice.positions_of(vertex, self.float_t)
-            if deform is None:
-                return p
-            offset = dr.clip(gather(self.vertices_t, deform, vertex), -1, 1)
-            return dr.fma(offset, dr.opaque(self.float_t, self.lattice.max_offset), p)
-
         stencil = Stencil(blocks)
-        vertices = stencil.apply(position)
+        vertices = stencil.apply(lambda vertex: self.lattice.offset_positions(vertex, deform, self.float_t))
         if msdf is None:
             msdf = dr.full(self.float_t, 1, stencil.count)
         else:
             # The cut lies at 0, which interpolation gives but for rounding.
             zeros = [dr.zeros(self.float_t, block.count) for block in blocks if isinstance(block, CutPoints)]
-            edges = [block.interpolate(msdf) for block in blocks if isinstance(block, EdgePoints)]
-            msdf = concatenate(edges + zeros)
-        dr.eval(vertices, msdf, [block.t for block in blocks])
+            others = [block.interpolate(msdf) for block in blocks if not isinstance(block, CutPoints)]
+            msdf = concatenate(others + zeros)
+        dr.eval(vertices, msdf, blocks)
         return SurfaceMesh(
             vertices, faces, msdf, self.lattice.vertex_count, stencil, kept_vertex_count=kept_count
         )
@@ -187,7 +194,7 @@ class GridExtraction(ABC):
 class MarchingExtraction(GridExtraction):
     """Extractions whose polygons' vertices lie on the edges of the lattice."""
 
-    def run(self, sdf: Any, msdf: Any, deform: Any, with_template: bool) -> SurfaceMesh:
+    def run(self, sdf: Any, msdf: Any, deform: Any, with_template: bool, weights: Any) -> SurfaceMesh:
         s = dr.detach(sdf)
         cells = self.active_cells(s)
         a, b = self.crossed_edges(cells)
@@ -199,8 +206,7 @@ class MarchingExtraction(GridExtraction):
 
         kept_count = count
         if msdf is not None:
-            positive = self.edge_points(s, a, b).interpolate(dr.detach(msdf)) >= NEGATIVE
-            kept, dropped = dr.compress(positive), dr.compress(~positive)
+            kept, dropped = self.kept_and_dropped(self.edge_points(s, a, b), msdf)
             kept_count = dr.width(kept)
         if kept_count == 0 and not with_template:
             return self.empty_mesh(False)
@@ -210,11 +216,7 @@ class MarchingExtraction(GridExtraction):
             mesh = uncut if kept_count else self.empty_mesh(False)
             return replace(mesh, template=uncut) if with_template else mesh
 
-        # Kept vertices first, so that those of the open surface and of its template agree.
-        order = dr.empty(self.uint_t, count)
-        dr.scatter(order, dr.arange(self.uint_t, kept_count), kept, mode=dr.ReduceMode.Permute)
-        rest = dr.arange(self.uint_t, count - kept_count) + dr.opaque(self.uint_t, kept_count)
-        dr.scatter(order, rest, dropped, mode=dr.ReduceMode.Permute)
+        order = self.kept_first(kept, dropped)
         polygons = polygons.renumbered(order)
         kept_points, dropped_points = (
             self.edge_points(sdf, dr.gather(self.uint_t, a, ids), dr.gather(self.uint_t, b, ids))

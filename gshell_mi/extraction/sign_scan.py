@@ -27,12 +27,15 @@ def expand(bits: Any, log2_slots: int) -> tuple[Any, Any]:
     return lane >> log2_slots, lane & mask
 
 
-def active_cells(s: Any, lattice: Lattice) -> Any:
+def active_cells(s: Any, lattice: Lattice, closed: bool = False) -> Any:
     """Cells whose corners have different signs, by their lowest vertex, and few others.
 
     This is the one pass over the whole field, so the field is read once and packed into one bit per
     vertex; a neighbour is then a shift in the stream of bits. The vertices at the upper borders count
     as cells too, for the edges that they own; their corners outside the lattice are wrapped around.
+
+    Args:
+        closed: vertices on the border count as outside.
     """
     float_t = type(s)
     uint_t = dr.uint32_array_t(float_t)
@@ -44,6 +47,10 @@ def active_cells(s: Any, lattice: Lattice) -> Any:
     for bit in range(32):
         vertex = dr.minimum(word * 32 + bit, last_vertex)
         inside |= dr.select(dr.gather(float_t, s, vertex) < NEGATIVE, uint_t(1 << bit), 0)
+    if closed:
+        border = border_vertices(lattice, uint_t)
+        others = ~(uint_t(1) << (border & 31))
+        dr.scatter_reduce(dr.ReduceOp.And, inside, others, border >> 5, mode=dr.ReduceMode.Local)
     dr.eval(inside)
 
     active = dr.zeros(uint_t)
@@ -61,3 +68,18 @@ def active_cells(s: Any, lattice: Lattice) -> Any:
         return words
     owner, bit = expand(dr.gather(uint_t, active, words), 5)
     return dr.gather(uint_t, words, owner) * 32 + bit
+
+
+def border_vertices(lattice: Lattice, uint_t: type) -> Any:
+    """Ids of the vertices on the six faces of the lattice; those on its edges more than once."""
+    stride = dr.opaque(uint_t, lattice.stride)
+    plane = stride * stride
+    index = dr.arange(uint_t, 6 * lattice.stride**2)
+    face = index // plane
+    i = (index - face * plane) // stride
+    j = index - face * plane - i * stride
+    side = dr.select(face & 1 == 1, stride - 1, 0)
+    along = dr.select(face < 2, 1, dr.select(face < 4, stride, plane))  # steps to the other side, i and j
+    step_i = dr.select(face < 2, stride, 1)
+    step_j = dr.select(face < 4, plane, stride)
+    return side * along + i * step_i + j * step_j

@@ -30,17 +30,50 @@ class EdgePoints:
     def interpolate(self, field: Any) -> Any:
         return self.apply(lambda vertex: gather(type(field), field, vertex))
 
+    def entries(self) -> list[tuple[Any, Any, Any]]:
+        """The interpolation as a sparse matrix: (point, lattice vertex, weight), entry by entry."""
+        point = dr.arange(type(self.a), self.count)
+        return [(point, self.a, 1 - self.t), (point, self.b, self.t)]
+
     def at(self, index: Any) -> "EdgePoints":
         a, b = (dr.gather(type(index), x, index) for x in (self.a, self.b))
         return EdgePoints(a, b, gather(type(self.t), self.t, index))
 
 
 @dataclass(frozen=True)
-class CutPoints:
-    """Points on the segment between two edge points: ``(1 - t) start + t end``."""
+class DualPoints:
+    """Weighted means of up to eight points on lattice edges, in eight slots per mean."""
 
-    start: EdgePoints
-    end: EdgePoints
+    edges: EdgePoints
+    """The points, eight per mean."""
+    weight: Any
+    """Their weights, which sum to 1 for each mean; 0 in unused slots."""
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.weight) // 8
+
+    def apply(self, fetch: Callable[[Any], Any]) -> Any:
+        return dr.block_sum(self.weight * self.edges.apply(fetch), 8)
+
+    def interpolate(self, field: Any) -> Any:
+        return self.apply(lambda vertex: gather(type(field), field, vertex))
+
+    def entries(self) -> list[tuple[Any, Any, Any]]:
+        return [(slot >> 3, vertex, self.weight * share) for slot, vertex, share in self.edges.entries()]
+
+    def at(self, index: Any) -> "DualPoints":
+        slot = dr.arange(type(index), 8 * dr.width(index))
+        source = dr.gather(type(index), index, slot >> 3) << 3 | slot & 7
+        return DualPoints(self.edges.at(source), gather(type(self.weight), self.weight, source))
+
+
+@dataclass(frozen=True)
+class CutPoints:
+    """Points on the segment between two other points: ``(1 - t) start + t end``."""
+
+    start: EdgePoints | DualPoints
+    end: EdgePoints | DualPoints
     t: Any  # Float in (0, 1), attached to both fields
 
     @property
@@ -50,12 +83,19 @@ class CutPoints:
     def apply(self, fetch: Callable[[Any], Any]) -> Any:
         return _lerp(self.start.apply(fetch), self.end.apply(fetch), self.t)
 
+    def entries(self) -> list[tuple[Any, Any, Any]]:
+        return [
+            (point, vertex, weight * gather(type(share), share, point))
+            for points, share in ((self.start, 1 - self.t), (self.end, self.t))
+            for point, vertex, weight in points.entries()
+        ]
+
 
 @dataclass(frozen=True)
 class Stencil:
     """How mesh vertices interpolate the lattice: blocks of points, one after the other."""
 
-    blocks: tuple[EdgePoints | CutPoints, ...]
+    blocks: tuple[EdgePoints | DualPoints | CutPoints, ...]
 
     @property
     def count(self) -> int:
@@ -64,6 +104,15 @@ class Stencil:
     def apply(self, fetch: Callable[[Any], Any]) -> Any:
         """The values at the mesh vertices of what ``fetch`` returns for lattice vertex ids."""
         return concatenate([block.apply(fetch) for block in self.blocks])
+
+    def entries(self) -> list[tuple[Any, Any, Any]]:
+        """The interpolation as a sparse matrix: arrays of (mesh vertex, lattice vertex, weight)."""
+        first, result = 0, []
+        for block in self.blocks:
+            for point, vertex, weight in block.entries():
+                result.append((point + dr.opaque(type(point), first), vertex, weight))
+            first += block.count
+        return result
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The three fields of a G-Shell on a lattice, as they are kept in files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from ..lattice import Lattice, make_lattice
 
 @dataclass(frozen=True)
 class LatticeFields:
-    """``sdf``, ``msdf`` and ``deform`` on the host, float32, in the order of ``Lattice``'s vertices.
+    """The fields on the host, float32, in the order of ``Lattice``'s vertices.
 
     >>> from gshell_mi.fields import sphere
     >>> from gshell_mi.lattice import TetLattice
@@ -29,6 +29,8 @@ class LatticeFields:
     """Offsets of the lattice vertices in [-1, 1], (3 n,): x0, y0, z0, x1, ..."""
     grid: str = "tet"
     """The kind of lattice, one of ``lattice.GRIDS``."""
+    weights: np.ndarray | None = None
+    """Weights of FlexiCubes (``Lattice.weight_count``); None for neutral ones."""
 
     @classmethod
     def closed(cls, sdf: np.ndarray, grid: str = "tet") -> "LatticeFields":
@@ -41,7 +43,7 @@ class LatticeFields:
         return make_lattice(self.grid, round(self.sdf.size ** (1 / 3)) - 1)
 
     def to_lattice(self, resolution: int) -> "LatticeFields":
-        """The fields on another lattice, interpolated trilinearly.
+        """The fields on a lattice of another resolution, interpolated trilinearly; neutral weights.
 
         Offsets are kept as lengths: they double in units of ``deform`` when the cells halve, and are
         clipped to what the new lattice allows.
@@ -58,16 +60,18 @@ class LatticeFields:
         return LatticeFields(zoom(self.sdf), zoom(self.msdf), clipped.ravel(), self.grid)
 
     def save(self, path: str | Path) -> None:
-        """Writes a compressed .npz with the arrays ``sdf``, ``msdf`` and ``deform``."""
+        """Writes a compressed .npz with the arrays ``sdf``, ``msdf``, ``deform`` and, if any, ``weights``."""
+        weights = {} if self.weights is None else {"weights": self.weights}
         with open(path, "wb") as file:  # a file object, as NumPy would append .npz to other names
-            np.savez_compressed(file, sdf=self.sdf, msdf=self.msdf, deform=self.deform)
+            np.savez_compressed(file, sdf=self.sdf, msdf=self.msdf, deform=self.deform, **weights)
 
     @classmethod
     def load(cls, path: str | Path, grid: str = "tet") -> "LatticeFields":
         """Reads what ``save`` wrote; without ``msdf`` it is 1 and without ``deform`` 0 everywhere.
 
         Args:
-            grid: the kind of lattice; the fields at its vertices can be used with any.
+            grid: the kind of lattice; the fields at its vertices can be used with any, ``weights`` are left
+                out where there are none.
 
         Raises:
             UserError: the file cannot be read, has no ``sdf`` or arrays that do not fit together.
@@ -85,8 +89,11 @@ class LatticeFields:
             raise UserError(f"{path}: sdf has {sdf.size} values, which is not (resolution + 1)^3")
         closed = cls.closed(sdf, grid)
         fields = cls(sdf, arrays.get("msdf", closed.msdf), arrays.get("deform", closed.deform), grid)
-        for name, needed in (("msdf", sdf.size), ("deform", 3 * sdf.size)):
-            size = getattr(fields, name).size
+        if "weights" in arrays and fields.lattice.weight_count:
+            fields = replace(fields, weights=arrays["weights"])
+        sizes = {"msdf": sdf.size, "deform": 3 * sdf.size, "weights": fields.lattice.weight_count}
+        for name, needed in sizes.items():
+            size = getattr(fields, name).size if getattr(fields, name) is not None else needed
             if size != needed:
                 raise UserError(f"{path}: {name} has {size} values, but sdf needs {needed} of them")
         return fields

@@ -97,16 +97,13 @@ def splat_to_lattice(values: mi.Float, template: SurfaceMesh,
     Returns:
         The field, and a mask of the lattice vertices that have a value.
     """
-    (points,) = template.stencil.blocks
     channels = dr.width(values) // template.vertex_count
     total = dr.zeros(mi.Float, channels * lattice.vertex_count)
     weight = dr.zeros(mi.Float, lattice.vertex_count)
     with dr.suspend_grad():
-        for end, share in ((points.a, 1 - points.t), (points.b, points.t)):
-            share = dr.detach(share)
+        for vertex, end, share in dr.detach(template.stencil.entries()):
             dr.scatter_reduce(dr.ReduceOp.Add, weight, share, end)
             for channel in range(channels):
-                index = channels * dr.arange(mi.UInt32, template.vertex_count) + channel
-                value = dr.gather(mi.Float, values, index)
+                value = dr.gather(mi.Float, values, channels * vertex + channel)
                 dr.scatter_reduce(dr.ReduceOp.Add, total, share * value, channels * end + channel)
     return LatticeDiffusion(lattice.stride).extend(total, weight)

@@ -70,7 +70,7 @@ def test_joining_a_twice_visited_face_splits_its_polygon(signs):
 def _shapes():
     """A polygon of every shape."""
     begins = tables.clip_tables()[0]
-    return list({begins[entry]: polygon for entry, polygon in tables.polygon_keys()}.values())
+    return list({begins[entry]: polygon for entry, polygon in tables.polygon_entries()}.values())
 
 
 @pytest.mark.parametrize("polygon", _shapes(), ids=lambda p: f"{len(p.edges)}-gon")

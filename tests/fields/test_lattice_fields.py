@@ -3,7 +3,7 @@ import pytest
 
 from gshell_mi import UserError
 from gshell_mi.fields import LatticeFields, sphere
-from gshell_mi.lattice import TetLattice
+from gshell_mi.lattice import GRIDS, TetLattice, make_lattice
 
 
 def test_round_trip(tmp_path):
@@ -14,6 +14,23 @@ def test_round_trip(tmp_path):
     for name in ("sdf", "msdf", "deform"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(fields, name))
     assert loaded.lattice == TetLattice(2)
+
+
+def test_weights_of_flexicubes(tmp_path):
+    weights = np.arange(21 * 8, dtype=np.float32)
+    sdf, deform = np.ones(27, np.float32), np.zeros(81, np.float32)
+    LatticeFields(sdf, sdf, deform, "flexicubes", weights).save(tmp_path / "a.npz")
+    np.testing.assert_array_equal(LatticeFields.load(tmp_path / "a.npz", "flexicubes").weights, weights)
+    assert LatticeFields.load(tmp_path / "a.npz", "cube").weights is None
+    np.savez(tmp_path / "b.npz", sdf=sdf, weights=np.ones(3))
+    with pytest.raises(UserError, match=r"b.npz: weights has 3 values, but sdf needs 168"):
+        LatticeFields.load(tmp_path / "b.npz", "flexicubes")
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_grid_is_kept(grid):
+    fields = sphere(make_lattice(grid, 6))
+    assert fields.lattice == make_lattice(grid, 6) and fields.to_lattice(9).lattice == make_lattice(grid, 9)
 
 
 def test_sdf_alone_is_closed(tmp_path):
