@@ -175,11 +175,12 @@ class _Sheet:
         pose = np.eye(4)
         distance = 3.0 * radius
         pose[:3] = np.stack([right, -np.cross(towards, right), -towards, self.center + distance * towards], 1)
-        focal = _OVERVIEW / 2 / math.tan(math.asin(radius / distance))
-        return Camera(_OVERVIEW, _OVERVIEW, focal, focal, _OVERVIEW / 2, _OVERVIEW / 2, pose)
+        size = 2 * _OVERVIEW    # drawn at twice its size, so that thin lines come out smooth
+        focal = size / 2 / math.tan(math.asin(radius / distance))
+        return Camera(size, size, focal, focal, size / 2, size / 2, pose)
 
     def _overview(self, observer: Camera) -> Image.Image:
-        shaded = np.full((_OVERVIEW, _OVERVIEW, 3), 255, np.uint8)
+        shaded = np.full((observer.height, observer.width, 3), 255, np.uint8)
         if self.hull is not None:
             normals, hit = _normals(self.hull, observer)
             grey = 0.35 + 0.6 * np.abs(normals @ -observer.forward)
@@ -187,12 +188,12 @@ class _Sheet:
         image = Image.fromarray(shaded)
         pen = ImageDraw.Draw(image)
         for a, b in _EDGES:
-            _line(pen, observer, self.corners[a], self.corners[b], _BOX, width=2)
+            _line(pen, observer, self.corners[a], self.corners[b], _BOX, width=4)
         for axis, color in zip(np.eye(3), _AXES, strict=True):
-            _line(pen, observer, self.center, self.center + 1.4 * self.half * axis, color, width=3)
+            _line(pen, observer, self.center, self.center + 1.4 * self.half * axis, color, width=6)
         for index in reversed(range(len(self.cameras))):
             self._frustum(pen, observer, self.cameras[index], _FRUSTUM if index else _FIRST)
-        return image
+        return image.resize((_OVERVIEW, _OVERVIEW), Image.Resampling.BOX)
 
     def _frustum(self, pen: ImageDraw.ImageDraw, observer: Camera, camera: Camera,
                  color: tuple[int, int, int]) -> None:
@@ -201,10 +202,10 @@ class _Sheet:
         film = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1], [0.5, -0.25, 1]])
         corners = camera.center + depth * film @ camera.basis().T
         for index in range(4):
-            _line(pen, observer, camera.center, corners[index], color)
-            _line(pen, observer, corners[index], corners[(index + 1) % 4], color)
+            _line(pen, observer, camera.center, corners[index], color, width=2)
+            _line(pen, observer, corners[index], corners[(index + 1) % 4], color, width=2)
         for index in range(2):
-            _line(pen, observer, corners[index], corners[4], color)
+            _line(pen, observer, corners[index], corners[4], color, width=2)
 
 
 def _hull(scene: FitScene, silhouettes: list[Silhouette]) -> mi.Scene | None:
