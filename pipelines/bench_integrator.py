@@ -21,20 +21,26 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import trimesh
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import gshell_mi  # noqa: F401  (registers the plugins when the variant is set)
+from gshell_mi.extraction import extract
+from gshell_mi.lattice import make_lattice
 from pipelines import gradient_scenes
+from pipelines.bench_extract import shirt as shirt_fields
 
 
 def shirt(faces):
-    v, f = gradient_scenes.shirt()
-    mesh = trimesh.Trimesh(v, f, process=False)
-    while 2 * len(mesh.faces) < faces:
-        mesh = mesh.subdivide()
-    return np.array(mesh.vertices), np.array(mesh.faces)
+    """An open shirt, extracted from fields on a lattice fine enough for about that many faces."""
+    cells, count = 32, 0
+    for _ in range(3):
+        lattice = make_lattice("tet", cells)
+        sdf, msdf = shirt_fields(lattice)
+        mesh = extract(lattice, mi.Float(sdf), mi.Float(msdf))
+        count = mesh.face_count
+        cells = max(8, round(cells * np.sqrt(faces / count)))
+    v, f = np.array(mesh.vertices).T, np.array(mesh.faces).T
+    return 1.3 * v[:, [0, 2, 1]] * np.array([1, 1, -1]), f
 
 
 def contestants(depth):

@@ -5,13 +5,9 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from ..errors import UserError
-from . import reparameterised_film
-from .light_edges import BATCH, light_from_point, sample_directions, sample_points, shadow_points
+from . import reparameterised_film, shadow_boundary
 from .path_sample import PathSample
 from .path_vertex import material_point, mis_weight, sample_direct, segment
-
-#: Batches of directions for the shadow boundaries of one render
-LIGHT_BATCHES = 2
 
 
 class GShellPathIntegrator(ADIntegrator):
@@ -143,62 +139,8 @@ class GShellPathIntegrator(ADIntegrator):
     # ------------------------------------------------------------------ shadows
 
     def boundary_terms(self, scene, tables, sensor, seed):
-        """Yields the :class:`BoundaryTerm` of what the first visible surface receives."""
-        if self.reparam_depth < 2 or self.max_depth < 2:
-            return
-        film = sensor.film()
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed, BATCH)
-        batches = [sample_directions(scene, sampler) for _ in range(LIGHT_BATCHES)]
-        for batch in batches:
-            batch.weight /= LIGHT_BATCHES
-        batches += sample_points(scene, sampler)
-        per_mesh = dr.prod(film.crop_size()) * self.light_edge_samples / (LIGHT_BATCHES * max(len(tables), 1))
-        for sources in batches:
-            for mesh, table in tables:
-                for term in shadow_points(scene, sensor, mesh, table, sources, max(int(per_mesh), 1),
-                                          sampler, int(min(self.reparam_depth, self.max_depth) > 2)):
-                    path_sampler = sampler.clone()
-                    path_sampler.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)),
-                                      dr.width(term.source))
-                    left, right = (self._reflected(scene, sensor, u, sources, term, path_sampler.clone())
-                                   for u in term.sides())
-                    both = left[1] & right[1]
-                    term.jump = reparameterised_film.film_channels(
-                        film, dr.select(both, left[0] - right[0], 0), mi.Float(0), [], mi.Color0f())
-                    dr.eval(term.jump)
-                    yield term
-
-    def _reflected(self, scene, sensor, u, sources, term, sampler):
-        """Light of one light sample that is seen at a film position, and whether that makes sense."""
-        position = u / mi.Vector2f(sensor.film().crop_size())
-        ray, throughput = sensor.sample_ray(sensor.shutter_open(), 0.0, position, mi.Point2f(0.5))
-        context = mi.BSDFContext()
-        si = self._first_hit(scene, ray).compute_surface_interaction(ray, mi.RayFlags.All)
-        active = si.is_valid()
-        direct = term.via is None
-        if not direct:
-            throughput = throughput * si.bsdf().eval(context, si, si.to_local(term.via), active)
-            distance = dr.norm(term.lit - si.p)
-            si = scene.ray_intersect(si.spawn_ray(term.via), active)
-            # Where the two sides see different surfaces, the silhouette of one of them is between
-            # them, and the light of the other kind of boundary term counts it.
-            active &= si.is_valid() & (dr.norm(si.p - term.lit) < 0.02 * distance + 1e-3)
-        if sources.is_point:
-            direction, arriving = light_from_point(scene, si, sources, term.source, active)
-        else:
-            direction = dr.gather(mi.Vector3f, dr.ravel(sources.position), term.source)
-            ray = si.spawn_ray(direction)
-            if direct:
-                arriving = self.primal(scene, sampler, ray, active, start=1).value
-            elif scene.environment() is None:
-                arriving = mi.Spectrum(0)
-            else:
-                sky = dr.zeros(mi.SurfaceInteraction3f, dr.width(u))
-                sky.wi = -direction
-                arriving = dr.select(scene.ray_test(ray, active), 0, scene.environment().eval(sky))
-        value = throughput * si.bsdf().eval(context, si, si.to_local(direction), active) * arriving
-        return dr.select(active, value, 0), active | mi.Bool(direct)
+        """Yields the :class:`~gshell_mi.integrators.shadow_boundary.BoundaryTerm` of shadows."""
+        return shadow_boundary.boundary_terms(self, scene, tables, sensor, seed)
 
     def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
         """Derivatives of camera paths.
