@@ -90,11 +90,17 @@ def scene_xml(stem: str, box: np.ndarray, resolution: int, light: str | None) ->
 
 
 def write_target(path: Path, rgba: np.ndarray) -> None:
-    """Writes (height, width, 4) linear premultiplied values as a half-float OpenEXR file."""
+    """Writes (height, width, 4) linear premultiplied values as a half-float OpenEXR file.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     bitmap = mi.Bitmap(np.ascontiguousarray(rgba, dtype=np.float32), mi.Bitmap.PixelFormat.RGBA)
     bitmap = bitmap.convert(component_format=mi.Struct.Type.Float16)
-    bitmap.metadata()["generatedBy"] = "gshell_mi.capture"
-    bitmap.write(str(path))
+    try:
+        bitmap.write(str(path))
+    except RuntimeError as error:    # Mitsuba's, in place of an OSError
+        raise OSError(f"{path.name}: {str(error).strip().splitlines()[-1]}") from error
 
 
 def write_record(folder: Path, record: dict) -> None:

@@ -17,7 +17,7 @@ from ..camera import Camera, Distortion
 from ..decoding import SUFFIXES, image_size
 from ..frames import Capture, Frame, camera_for_image, pose_of
 
-_MODELS = ("", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+_MODELS = ("", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 #: Flags of instant-ngp for cameras that are no pinholes with OpenCV's distortion.
 _OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
 _Z_UP = np.array([0.0, 0.0, 1.0])
