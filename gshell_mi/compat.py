@@ -60,3 +60,11 @@ def write_mesh(mesh: Any, positions: Any, faces: Any, normals: Any = None, **att
     for name, values in attributes.items():
         params[name] = values
     return params.update()
+
+
+def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> mi.Mesh:
+    """A mesh of (V, 3) positions and (F, 3) indices, shaded with face normals."""
+    mesh = mi.Mesh(name, len(vertices), len(faces))
+    write_mesh(mesh, mi.Float(np.ascontiguousarray(vertices, np.float32).ravel()),
+               mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel()))
+    return mesh

@@ -56,6 +56,8 @@ def read_ply(path: Path) -> FittedMesh:
     """
     if not path.is_file():
         raise UserError(f"'{path}' does not exist; give the folder of a finished fit.")
+    if b"\nelement face 0\n" in path.read_bytes()[:4096]:  # which trimesh takes for no mesh at all
+        return FittedMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3)), {})
     try:
         mesh = trimesh.load(path, process=False, force="mesh")
         table = mesh.metadata["_ply_raw"]["vertex"]["data"]
