@@ -92,6 +92,8 @@ class FitConfig:
     """Weight of the mask loss."""
     material_smoothness: float = 0.01
     """Weight of the difference between the material at a point and at a point nearby."""
+    flexicubes_deviation: float = 0.01
+    """Weight of the FlexiCubes regulariser, in cells; only used with that grid."""
     light_grey: float = 0.005
     """Weight of the grey-world prior of the light."""
 

@@ -7,14 +7,12 @@ import mitsuba as mi
 import numpy as np
 
 from .. import losses
+from ..extraction.flexicubes import deviation
 from ..fields.smoothing import LatticeDiffusion
 from ..light import EnvironmentLight
 from ..material import ATTRIBUTES, MaterialField, principled
 from ..scene import FitScene
 from .config import FitConfig
-
-#: Parameters of the geometry on the lattice, by their names in ``mi.traverse`` of the shape.
-GEOMETRY = ("sdf", "msdf", "deform")
 
 
 class JointStage:
@@ -41,7 +39,7 @@ class JointStage:
         # One step size for the whole surface: normalising each vertex on its own would undo the smoothing
         # and let noise move the vertices that few pixels see as far as all others.
         self.geometry = mi.ad.Adam(lr=config.geometry_lr, uniform=True)
-        for name in GEOMETRY:
+        for name in self.subject.field_names:
             self.geometry[name] = mi.Float(self.parameters[f"subject.{name}"])
         self.shading = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
         if light:
@@ -88,7 +86,7 @@ class JointStage:
     def _apply(self, *, geometry: bool) -> None:
         """Puts the optimisers' parameters into the scene, attached."""
         if geometry:
-            for name in GEOMETRY:
+            for name in self.subject.field_names:
                 self.parameters[f"subject.{name}"] = self.geometry[name]
         self.material.parameters = {name: self.shading[name] for name in ATTRIBUTES}
         for name, field in self.material.values().items():
@@ -106,6 +104,9 @@ class JointStage:
             channels = dr.width(field) // self.subject.lattice.vertex_count
             values = surface.interpolate(field, channels)
             total += config.material_smoothness * losses.edge_smoothness(values, faces)
+        if "weights" in self.subject.field_names:
+            spread = deviation(self.subject.surface, self.subject.lattice, self.subject.deform)
+            total += config.flexicubes_deviation * dr.mean(spread) / self.subject.lattice.spacing
         if self.light:
             texels = dr.unravel(mi.Color3f, self.light.radiance.array)
             total += config.light_grey * losses.grey_world(texels)
@@ -114,12 +115,17 @@ class JointStage:
     def _step_geometry(self, decay: float, smoothing: float) -> None:
         optimizer, config = self.geometry, self.config
         cell = self.subject.lattice.spacing
-        for name in GEOMETRY:
+        for name in self.subject.field_names:
             gradient = dr.grad(optimizer[name])
             gradient = dr.select(dr.isfinite(gradient), gradient, 0)
-            dr.set_grad(optimizer[name], self._diffuse(gradient, smoothing))
+            # The weights of FlexiCubes belong to cubes, one by one.
+            if name != "weights":
+                gradient = self._diffuse(gradient, smoothing)
+            dr.set_grad(optimizer[name], gradient)
         rate = decay * config.geometry_lr * cell
-        optimizer.set_learning_rate({"sdf": rate, "msdf": rate, "deform": decay * config.deform_lr})
+        local = decay * config.deform_lr
+        rates = {"sdf": rate, "msdf": rate, "deform": local, "weights": local}
+        optimizer.set_learning_rate({name: rates[name] for name in self.subject.field_names})
         optimizer.step()
         optimizer["deform"] = dr.minimum(dr.maximum(optimizer["deform"], -1), 1)
 
