@@ -149,7 +149,7 @@ class ColorDecoding:
             linear = self._decode(rgb, integer=False).astype(np.float32)
         if self._to_rec709 is not None:
             linear = linear @ self._to_rec709
-        return np.maximum(linear, 0.0)
+        return np.maximum(linear, 0.0, out=linear)
 
     def _decode(self, values: np.ndarray, *, integer: bool) -> np.ndarray:
         colour = _colour_science()

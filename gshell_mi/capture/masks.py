@@ -130,11 +130,10 @@ def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None)
         if mask.shape[:2] != pixels.shape[:2]:
             raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "
                             f"is {pixels.shape[1]} x {pixels.shape[0]}; resize it.")
-        values = _unit(mask)
         # Some tools put the mask into alpha and leave the colour empty or as it was.
-        if values.shape[2] == 4 and values[..., 3].min() < 1:
-            return np.clip(values[..., 3], 0, 1)
-        return np.clip(values[..., :3].mean(axis=-1), 0, 1)
+        in_alpha = mask.shape[2] == 4 and _unit(mask[..., 3]).min() < 1
+        values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
+        return np.clip(_unit(values, mask.dtype), 0, 1)
     if pixels.shape[2] < 4:
         raise UserError(f"Image '{frame.image}' has no alpha, and there is no mask for it; {_SUPPLY}.")
     alpha = np.clip(_unit(pixels[..., 3]), 0, 1)
@@ -144,8 +143,12 @@ def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None)
     return alpha
 
 
-def _unit(values: np.ndarray) -> np.ndarray:
-    """Integers scaled to [0, 1]; float32."""
-    if values.dtype.kind == "u":
-        return values.astype(np.float32) / np.iinfo(values.dtype).max
-    return values.astype(np.float32)
+def _unit(values: np.ndarray, stored: np.dtype | None = None) -> np.ndarray:
+    """Values of integer files scaled to [0, 1]; float32.
+
+    Args:
+        stored: type of the file's values, if ``values`` have been computed from them.
+    """
+    stored = stored or values.dtype
+    scale = np.iinfo(stored).max if stored.kind == "u" else 1
+    return values.astype(np.float32) / np.float32(scale)

@@ -59,16 +59,15 @@ class Preparation:
         """
         pixels = read_pixels(frame.image)
         coverage = coverage_of(frame, pixels, self.background)[..., None]
-        linear = self.decoding.linear(pixels[..., :3])
+        rgb = self.decoding.linear(pixels[..., :3])
+        # In place, for a photograph of 24 megapixels takes 300 MB by now.
         if self.background is not None:
-            behind = self._encoded(self.background.color, pixels.dtype)
-            rgb = np.maximum(linear - (1 - coverage) * self.decoding.linear(behind), 0)
-        elif _is_premultiplied(frame, pixels):
-            rgb = linear
-        else:
-            rgb = linear * coverage
-        rgb = np.minimum(rgb * self.gains.get(frame.image, 1.0), _BRIGHTEST)
-        image = np.concatenate([rgb, coverage], axis=-1).astype(np.float32)
+            rgb -= (1 - coverage) * self.decoding.linear(self._encoded(self.background.color, pixels.dtype))
+        elif not _is_premultiplied(frame, pixels):
+            rgb *= coverage
+        rgb *= np.float32(self.gains.get(frame.image, 1.0))
+        np.clip(rgb, 0.0, _BRIGHTEST, out=rgb)
+        image = np.concatenate([rgb, coverage], axis=-1)
         # The lens formula is in units of the focal length, so it holds for the small image, at less cost.
         return Prepared(*rectify(*shrink(image, frame.camera, self.max_size)), _clipped(pixels, coverage))
 
