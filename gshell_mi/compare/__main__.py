@@ -1,0 +1,123 @@
+"""``python -m gshell_mi.compare``: scores on the screen, as JSON and as error images."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from ..doctor import ensure_variant
+from ..errors import UserError
+from ..evaluation import IMAGE_SCORES
+
+_MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
+
+
+@dataclass(frozen=True)
+class _Arguments:
+    first: tyro.conf.Positional[Path]
+    """What is judged: the folder of a fit, an EXR file, a folder of EXR files, or a mesh file."""
+    second: tyro.conf.Positional[Path | None] = None
+    """The reference: an EXR file, a folder of EXR files or a mesh file. A fit needs none."""
+    targets: Path | None = None
+    """Of a fit: folder of the images <sensor id>.exr; default: those it was made from."""
+    sensors: Path | None = None
+    """Of a fit: scene file with other sensors, such as held-out views; then --targets names their images."""
+    envmap: Path | None = None
+    """Of a fit: render under this environment map (EXR) instead of the fitted light; the scores come raw and
+    after the best factor per colour channel on the albedo."""
+    mesh: Path | None = None
+    """Of a fit: the true surface, to score the geometry as well."""
+    spp: int = 64
+    """Of a fit: samples per pixel."""
+    json: Path | None = None
+    """File for the scores."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Folder for error images: reference, result and FLIP map side by side."""
+    variant: str = "llvm_ad_rgb"
+    """Mitsuba variant: llvm_ad_rgb (CPU) or cuda_ad_rgb (NVIDIA GPU)."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    try:
+        given = tyro.cli(_Arguments, args=arguments, prog="python -m gshell_mi.compare",
+                         description="Score images, a fit or a mesh against a reference.")
+        ensure_variant(given.variant)
+        result = _compare(given)
+        if given.json:
+            given.json.write_text(json.dumps(result, indent=1))
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"error: '{error.filename}' cannot be written ({error.strerror}); choose another place.",
+              file=sys.stderr)
+        return 2
+    _show(result)
+    return 0
+
+
+def _compare(given: _Arguments) -> dict:
+    from .compare import compare_fit, compare_folders, compare_meshes
+
+    if given.second is None:
+        if not given.first.exists():
+            raise UserError(f"'{given.first}' does not exist; check the path.")
+        if not given.first.is_dir():
+            raise UserError(f"'{given.first}' is compared with nothing; give the reference after it.")
+        if given.spp < 1:
+            raise UserError(f"--spp must be at least 1, not {given.spp}.")
+        if given.sensors and not given.targets:
+            raise UserError("--sensors names other views than the fit's; give their images with --targets.")
+        if given.envmap and not given.targets:
+            raise UserError("--envmap relights the fit; give the images under that light with --targets.")
+        return compare_fit(given.first, targets=given.targets, sensors=given.sensors, envmap=given.envmap,
+                           mesh=given.mesh, spp=given.spp, errors=given.output)
+    for name in ("targets", "sensors", "envmap", "mesh"):
+        if getattr(given, name):
+            raise UserError(f"--{name} is for fits only; leave it out, or leave out '{given.second}'.")
+    kinds = [path.suffix.lower() in _MESHES for path in (given.first, given.second)]
+    if all(kinds):
+        return compare_meshes(given.first, given.second)
+    if any(kinds):
+        raise UserError(f"Of '{given.first}' and '{given.second}' only one is a mesh; give two of a kind.")
+    return compare_folders(given.first, given.second, given.output)
+
+
+def _show(result: dict) -> None:
+    console = Console(highlight=False)
+    if "mean" in result:
+        table = Table("", *IMAGE_SCORES)
+        for name, scores in result["views"].items():
+            table.add_row(name, *_row(scores))
+        table.add_section()
+        table.add_row("mean (raw)" if "mean_albedo_scaled" in result else "mean", *_row(result["mean"]))
+        if "mean_albedo_scaled" in result:
+            table.add_row("mean (albedo scaled)", *_row(result["mean_albedo_scaled"]))
+        console.print(table)
+        if "albedo_scale" in result:
+            console.print("albedo scale (R, G, B):", ", ".join(f"{x:.3f}" for x in result["albedo_scale"]))
+    if "mesh" in result:
+        table = Table("surface", "found", "reference")
+        for name, value in result["mesh"].items():
+            if isinstance(value, dict):
+                table.add_row(name, *(f"{value[key]:g}" for key in ("found", "reference")))
+            else:
+                table.add_row(name, f"{value:.4f}", "")
+        console.print(table)
+
+
+def _row(scores: dict[str, float]) -> list[str]:
+    return [f"{scores[name]:.2f}" if name in ("psnr", "delta_e") else f"{scores[name]:.4f}"
+            for name in IMAGE_SCORES]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,161 @@
+"""Comparisons of whole sets: folders of images, a fit against its targets, meshes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UserError
+from ..evaluation import IMAGE_SCORES, albedo_scale, image_scores, mesh_scores, read_image
+from ..evaluation.mesh_scores import read_mesh
+from ..images import over_white, write_png
+from ..targets import load_target
+
+Report = Callable[[int, int], None]
+
+
+def compare_folders(first: Path, second: Path, errors: Path | None = None) -> dict:
+    """Scores of two EXR files, or of the files with the same names in two folders.
+
+    Args:
+        first: what is judged.
+        second: the reference.
+        errors: folder for the FLIP maps (magma).
+
+    Returns:
+        ``views`` (scores by name) and ``mean``.
+
+    Raises:
+        UserError: a path is missing, the folders share no file, or images do not fit together.
+    """
+    pairs = _pairs(Path(first), Path(second))
+    views = {}
+    for name, (image, reference) in pairs.items():
+        views[name] = _score(name, read_image(image), read_image(reference), errors)
+    return {"views": views, "mean": _mean(views)}
+
+
+def compare_meshes(first: Path, second: Path) -> dict:
+    """Scores of the mesh file ``first`` against the reference ``second`` (``evaluation.mesh_scores``)."""
+    return {"mesh": mesh_scores(read_mesh(first), read_mesh(second))}
+
+
+def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | None = None,
+                envmap: Path | None = None, mesh: Path | None = None, spp: int = 64,
+                errors: Path | None = None, progress: Report | None = None) -> dict:
+    """Renders a fit and scores it.
+
+    Args:
+        folder: the fit's.
+        targets: folder of ``<sensor id>.exr``; default: that which the fit was made from.
+        sensors: scene file whose sensors are used, such as those of held-out views; default: the training
+            views of ``scene.xml``.
+        envmap: light to render under instead of the fitted one; then the scores come raw and after
+            ``albedo_scale`` (``mean_albedo_scaled``).
+        mesh: the true surface, to score the geometry too.
+        spp: samples per pixel.
+        errors: folder for the FLIP maps (magma).
+        progress: called with (views done, views).
+
+    Returns:
+        ``views`` (scores by sensor), ``mean``, and what ``envmap`` and ``mesh`` add.
+
+    Raises:
+        UserError: something is missing or does not fit together.
+    """
+    folder = Path(folder)
+    scene = load_fitted_scene(folder, envmap)
+    targets = Path(targets) if targets else _recorded_targets(folder)
+    cameras = _load(sensors).sensors() if sensors else scene.sensors()
+    references = [load_target(targets / f"{camera.id()}.exr", *camera.film().crop_size()).rgba
+                  for camera in cameras]
+    integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
+    images = []
+    for number, camera in enumerate(cameras):
+        image = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=number))
+        if image.shape[2] != 4:
+            raise UserError(f"Sensor '{camera.id()}' has a film without alpha; set its pixel_format to rgba.")
+        images.append(image)
+        if progress:
+            progress(number + 1, len(cameras))
+    names = [camera.id() for camera in cameras]
+    views = {name: _score(name, image, reference, errors)
+             for name, image, reference in zip(names, images, references, strict=True)}
+    result = {"views": views, "mean": _mean(views)}
+    if envmap:
+        scale = albedo_scale(images, references)
+        factors = np.append(scale, 1.0)
+        scaled = {name: image_scores(image * factors, reference)[0]
+                  for name, image, reference in zip(names, images, references, strict=True)}
+        result |= {"mean_albedo_scaled": _mean(scaled), "albedo_scale": scale.tolist()}
+    if mesh:
+        result |= compare_meshes(folder / "mesh.ply", mesh)
+    return result
+
+
+def load_fitted_scene(folder: Path, envmap: Path | None = None) -> mi.Scene:
+    """``scene.xml`` of a fit, lit by ``envmap`` if given.
+
+    Raises:
+        UserError: there is no fit in the folder, or the map is missing or no image.
+    """
+    if not (folder / "scene.xml").is_file():
+        raise UserError(f"'{folder}' holds no fit (scene.xml is missing); give the folder that a fit wrote.")
+    scene = _load(folder / "scene.xml")
+    if envmap is None:
+        return scene
+    read_image(envmap)
+    content = {"type": "scene", "light": {"type": "envmap", "id": "light", "filename": str(envmap)}}
+    content |= {f"shape_{number}": shape for number, shape in enumerate(scene.shapes())}
+    return mi.load_dict(content | {sensor.id(): sensor for sensor in scene.sensors()})
+
+
+def _load(path: Path) -> mi.Scene:
+    if not Path(path).is_file():
+        raise UserError(f"Scene '{path}' does not exist; check the path.")
+    try:
+        return mi.load_file(str(path))
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise UserError(f"Scene '{path}' cannot be loaded by Mitsuba: {reason}") from error
+
+
+def _recorded_targets(folder: Path) -> Path:
+    try:
+        return Path(json.loads((folder / "metrics.json").read_text())["targets"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"'{folder / 'metrics.json'}' does not tell where the targets are; name their folder "
+                        f"with --targets.") from error
+
+
+def _pairs(first: Path, second: Path) -> dict[str, tuple[Path, Path]]:
+    for path in (first, second):
+        if not path.exists():
+            raise UserError(f"'{path}' does not exist; check the path.")
+    if first.is_dir() != second.is_dir():
+        raise UserError(f"'{first}' and '{second}' are a folder and a file; give two of a kind.")
+    if not first.is_dir():
+        return {first.stem: (first, second)}
+    names = sorted({p.name for p in first.glob("*.exr")} & {p.name for p in second.glob("*.exr")})
+    if not names:
+        raise UserError(f"'{first}' and '{second}' have no EXR files of the same name; rename them in pairs.")
+    return {Path(name).stem: (first / name, second / name) for name in names}
+
+
+def _score(name: str, image: np.ndarray, reference: np.ndarray, errors: Path | None) -> dict[str, float]:
+    try:
+        scores, flip = image_scores(image, reference)
+    except UserError as error:
+        raise UserError(f"'{name}': {error}") from error
+    if errors:
+        errors.mkdir(parents=True, exist_ok=True)
+        write_png(errors / f"{name}.png", np.concatenate([over_white(reference), over_white(image), flip], 1))
+    return scores
+
+
+def _mean(views: dict[str, dict[str, float]]) -> dict[str, float]:
+    return {score: float(np.mean([scores[score] for scores in views.values()])) for score in IMAGE_SCORES}

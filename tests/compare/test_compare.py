@@ -1,0 +1,117 @@
+"""The compare command: fits, folders, files and meshes; and every mistake in one sentence."""
+
+import json
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from fitted import RADIUS, open_sphere, write_fit
+from PIL import Image
+
+from gshell_mi.compare.__main__ import main
+
+VIEWS, SIZE = 2, 32
+
+
+@pytest.fixture(scope="module")
+def sphere(tmp_path_factory):
+    """A fit, its targets (rendered from itself), and targets under half the light."""
+    folder = write_fit(tmp_path_factory.mktemp("fit"), open_sphere(3), views=VIEWS, size=SIZE)
+    targets, dim = (tmp_path_factory.mktemp(name) for name in ("targets", "dim"))
+    scene = mi.load_file(str(folder / "scene.xml"))
+    for number, sensor in enumerate(scene.sensors()):
+        image = np.array(mi.render(scene, sensor=sensor, spp=256, seed=100 + number))
+        for place, factor in ((targets, 1.0), (dim, 0.5)):
+            pixels = (image * [factor, factor, factor, 1]).astype(np.float32)
+            mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGBA).write(str(place / f"{sensor.id()}.exr"))
+    (folder / "metrics.json").write_text(json.dumps({"targets": str(targets)}))
+    return SimpleNamespace(folder=folder, targets=targets, dim=dim)
+
+
+def scores(*arguments, tmp_path) -> dict:
+    out = tmp_path / "scores.json"
+    assert main([*map(str, arguments), "--json", str(out)]) == 0
+    return json.loads(out.read_text())
+
+
+def test_fit_against_its_targets(sphere, tmp_path, capsys):
+    found = scores(sphere.folder, "-o", tmp_path / "errors", "--mesh", sphere.folder / "mesh.ply",
+                   tmp_path=tmp_path)
+    assert set(found["views"]) == {"view_000", "view_001"}
+    assert found["mean"]["psnr"] > 30 and found["mean"]["mask_iou"] > 0.97
+    assert found["mesh"]["boundary_loops"] == {"found": 1, "reference": 1}
+    picture = Image.open(tmp_path / "errors" / "view_000.png")
+    assert picture.size == (3 * SIZE, SIZE)
+    shown = capsys.readouterr().out
+    assert "view_001" in shown and "boundary_loops" in shown
+
+
+def test_relighting_is_scored_raw_and_scaled(sphere, tmp_path):
+    """Targets half as bright: the albedo's factor is 1/2, and only the scaled score is high."""
+    found = scores(sphere.folder, "--envmap", sphere.folder / "light.exr", "--targets", sphere.dim,
+                   tmp_path=tmp_path)
+    np.testing.assert_allclose(found["albedo_scale"], 0.5, rtol=0.02)
+    assert found["mean_albedo_scaled"]["psnr"] > 30 > 25 > found["mean"]["psnr"]
+
+
+def test_files_and_folders(sphere, tmp_path):
+    whole = scores(sphere.targets, sphere.dim, tmp_path=tmp_path)
+    one = scores(sphere.targets / "view_000.exr", sphere.dim / "view_000.exr", tmp_path=tmp_path)
+    assert one["mean"] == one["views"]["view_000"] == whole["views"]["view_000"]
+    assert whole["mean"]["psnr"] == pytest.approx(
+        np.mean([view["psnr"] for view in whole["views"].values()]))
+
+
+def test_meshes(sphere, tmp_path):
+    found = scores(sphere.folder / "mesh.ply", sphere.folder / "template.ply", tmp_path=tmp_path)
+    assert found["mesh"]["f_score"] == 1
+
+
+def test_other_sensors(sphere, tmp_path):
+    found = scores(sphere.folder, "--sensors", sphere.folder / "scene.xml", "--targets", sphere.targets,
+                   tmp_path=tmp_path)
+    assert found["mean"]["psnr"] > 30
+
+
+@pytest.mark.parametrize("arguments, message", [
+    (("{none}",), "does not exist; check the path"),
+    (("{mesh}",), "is compared with nothing; give the reference after it"),
+    (("{empty}",), "holds no fit (scene.xml is missing)"),
+    (("{fit}", "--spp", "0"), "--spp must be at least 1"),
+    (("{fit}", "--sensors", "{none}"), "give their images with --targets"),
+    (("{fit}", "--sensors", "{none}", "--targets", "{empty}"), "does not exist; check the path"),
+    (("{fit}", "--targets", "{empty}"), "view_000.exr' is missing"),
+    (("{fit}", "--envmap", "{none}", "--targets", "{targets}"), "does not exist; check the path"),
+    (("{fit}", "--envmap", "{text}", "--targets", "{targets}"), "cannot be read"),
+    (("{fit}", "--mesh", "{none}"), "does not exist; check the path"),
+    (("{fit}", "--mesh", "{text}"), "cannot be read"),
+    (("{fit}", "--variant", "scalar_rgb"), "is not usable"),
+    (("{targets}", "{none}"), "does not exist; check the path"),
+    (("{targets}", "{targets}/view_000.exr"), "are a folder and a file"),
+    (("{targets}", "{empty}"), "have no EXR files of the same name"),
+    (("{mesh}", "{targets}"), "only one is a mesh"),
+    (("{targets}", "{targets}", "--mesh", "{mesh}"), "--mesh is for fits only"),
+    (("{targets}/view_000.exr", "{fit}/scene.xml"), "cannot be read"),
+    (("{targets}/view_000.exr", "{fit}/light.exr"), "only images of one size"),
+    (("{targets}", "{dim}", "--json", "{none}/a/b.json"), "cannot be written"),
+])
+def test_mistakes(sphere, tmp_path, capsys, arguments, message):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.ply").write_text("no mesh")
+    places = {"none": tmp_path / "none", "empty": tmp_path / "empty", "text": tmp_path / "text.ply",
+              "fit": sphere.folder, "mesh": sphere.folder / "mesh.ply", "targets": sphere.targets,
+              "dim": sphere.dim}
+    assert main([argument.format(**places) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and message in error and error.count("\n") == 1
+
+
+def test_fit_that_does_not_know_its_targets(sphere, tmp_path, capsys):
+    folder = write_fit(tmp_path, open_sphere(2), views=1)
+    assert main([str(folder)]) == 2
+    assert "does not tell where the targets are" in capsys.readouterr().err
+
+
+def test_sphere_is_what_it_claims():
+    assert np.linalg.norm(open_sphere(3).vertices, axis=1) == pytest.approx(RADIUS)
