@@ -1,8 +1,8 @@
 """Photographs one of our scenes as a NeRF-synthetic data set, to try ``gshell_mi.capture`` on.
 
     python pipelines/make_nerf_capture.py scenes/tshirt/reference.xml out/captures/tshirt [--spp 32]
-    python -m gshell_mi.capture out/captures/tshirt -o out/captures/tshirt.xml --max-size 400
-    python -m gshell_mi.fit out/captures/tshirt.xml -o out/captures/tshirt_fit
+    python -m gshell_mi.capture out/captures/tshirt -o out/captures/scenes/tshirt.xml
+    python -m gshell_mi.fit out/captures/scenes/tshirt.xml -o out/captures/fit
 
 It writes what Mildenhall et al. (NeRF, ECCV 2020) rendered with Blender: ``transforms_train.json`` and
 ``transforms_test.json`` (one ``camera_angle_x``, camera-to-world matrices with the camera's x right, y up and
