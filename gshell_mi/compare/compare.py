@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import UserError
 from ..evaluation import IMAGE_SCORES, albedo_scale, image_scores, mesh_scores, read_image
 from ..evaluation.mesh_scores import read_mesh
+from ..export.fitted_scene import load_fitted_scene, load_scene
 from ..images import over_white, write_png
 from ..targets import load_target
 
@@ -70,7 +71,7 @@ def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | No
     folder = Path(folder)
     scene = load_fitted_scene(folder, envmap)
     targets = Path(targets) if targets else _recorded_targets(folder)
-    cameras = _load(sensors).sensors() if sensors else scene.sensors()
+    cameras = load_scene(sensors).sensors() if sensors else scene.sensors()
     references = [load_target(targets / f"{camera.id()}.exr", *camera.film().crop_size()).rgba
                   for camera in cameras]
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
@@ -95,33 +96,6 @@ def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | No
     if mesh:
         result |= compare_meshes(folder / "mesh.ply", mesh)
     return result
-
-
-def load_fitted_scene(folder: Path, envmap: Path | None = None) -> mi.Scene:
-    """``scene.xml`` of a fit, lit by ``envmap`` if given.
-
-    Raises:
-        UserError: there is no fit in the folder, or the map is missing or no image.
-    """
-    if not (folder / "scene.xml").is_file():
-        raise UserError(f"'{folder}' holds no fit (scene.xml is missing); give the folder that a fit wrote.")
-    scene = _load(folder / "scene.xml")
-    if envmap is None:
-        return scene
-    read_image(envmap)
-    content = {"type": "scene", "light": {"type": "envmap", "id": "light", "filename": str(envmap)}}
-    content |= {f"shape_{number}": shape for number, shape in enumerate(scene.shapes())}
-    return mi.load_dict(content | {sensor.id(): sensor for sensor in scene.sensors()})
-
-
-def _load(path: Path) -> mi.Scene:
-    if not Path(path).is_file():
-        raise UserError(f"Scene '{path}' does not exist; check the path.")
-    try:
-        return mi.load_file(str(path))
-    except Exception as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise UserError(f"Scene '{path}' cannot be loaded by Mitsuba: {reason}") from error
 
 
 def _recorded_targets(folder: Path) -> Path:

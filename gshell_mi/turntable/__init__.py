@@ -1,0 +1,5 @@
+"""Turntables of fitted objects: ``python -m gshell_mi.turntable``."""
+
+from .turntable import TurntableConfig, render_turntable, write_video
+
+__all__ = ["TurntableConfig", "render_turntable", "write_video"]

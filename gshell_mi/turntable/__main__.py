@@ -1,0 +1,59 @@
+"""``python -m gshell_mi.turntable``: once around a fitted object, as MP4 and GIF."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ..doctor import ensure_variant
+from ..errors import UserError
+from .turntable import TurntableConfig, render_turntable, write_video
+
+
+@dataclass(frozen=True)
+class _Arguments:
+    folder: tyro.conf.Positional[Path]
+    """Folder of a finished fit."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """The MP4; the GIF of the same name comes beside it. Default: turntable.mp4 in the fit's folder."""
+    envmap: Path | None = None
+    """Environment map (EXR, latitude-longitude) to light the object with instead of the fitted light."""
+    variant: str = "llvm_ad_rgb"
+    """Mitsuba variant: llvm_ad_rgb (CPU) or cuda_ad_rgb (NVIDIA GPU)."""
+    quiet: bool = False
+    """No progress bar."""
+    config: Annotated[TurntableConfig, tyro.conf.arg(name="")] = dataclasses.field(
+        default_factory=TurntableConfig)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    try:
+        given = tyro.cli(_Arguments, args=arguments, prog="python -m gshell_mi.turntable",
+                         description="Render a turntable of a fitted object.",
+                         config=(tyro.conf.FlagCreatePairsOff,))
+        ensure_variant(given.variant)
+        frames = render_turntable(given.folder, given.config, envmap=given.envmap)
+        columns = (TextColumn("turntable"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=Console(stderr=True), disable=given.quiet) as progress:
+            tracked = progress.track(frames, total=given.config.frames)
+            files = write_video(tracked, given.output or given.folder / "turntable.mp4", given.config.fps)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return 130
+    print(*files, sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
