@@ -151,6 +151,8 @@ def rigid(matrix: np.ndarray) -> np.ndarray:
     """
     if not np.isfinite(matrix).all():
         raise ValueError("holds NaN or infinity")
+    if np.abs(matrix).max() > 1e12:
+        raise ValueError("holds numbers too large for a position")
     linear = matrix[:3, :3]
     scale = np.cbrt(abs(np.linalg.det(linear)))
     if scale < 1e-9:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -86,9 +87,13 @@ def camera_for_image(declared: Camera, size: tuple[int, int], image: Path) -> Ca
     """The declared camera at the (width, height) of the image file, perhaps a shrunk copy of the original.
 
     Raises:
-        UserError: their aspect ratios differ.
+        UserError: their aspect ratios differ, or the declared numbers are of no camera.
     """
     width, height = size
+    if not _is_possible(declared):
+        raise UserError(f"The camera of image '{image}' has impossible intrinsics ({declared.width} x "
+                        f"{declared.height} pixels, focal lengths {declared.fx:g}, {declared.fy:g}, centre "
+                        f"{declared.cx:g}, {declared.cy:g}, {declared.distortion}); export it again.")
     if (declared.width, declared.height) == size:
         return declared
     # A size that is rounded to whole pixels changes the aspect by up to a pixel.
@@ -99,3 +104,14 @@ def camera_for_image(declared: Camera, size: tuple[int, int], image: Path) -> Ca
         raise UserError(f"Image '{image}' is {width} x {height} pixels, but its camera is declared for "
                         f"{declared.width} x {declared.height}; {cure}.")
     return declared.resized(width, height)
+
+
+def _is_possible(camera: Camera) -> bool:
+    """Whether the numbers are those of any camera; wide of what is sensible, but good to compute with."""
+    lens = dataclasses.astuple(camera.distortion)
+    if not np.isfinite((camera.fx, camera.fy, camera.cx, camera.cy, *lens)).all():
+        return False
+    longest = max(camera.width, camera.height)
+    focal = sorted((camera.fx, camera.fy))
+    return (min(camera.width, camera.height) >= 1 and 1e-3 * longest < focal[0] and focal[1] < 1e5 * longest
+            and max(abs(camera.cx), abs(camera.cy)) < 100 * longest and max(map(abs, lens)) < 1e4)

@@ -62,7 +62,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
                             f"with; export the model again.")
         path = images / name
         pose = pose_of(_camera_to_world(quaternion, translation), f"image '{name}' of '{model}'")
-        frames.append(Frame(path, camera_for_image(_camera(*cameras[camera], pose, model, name),
+        frames.append(Frame(path, camera_for_image(_camera(*cameras[camera], pose),
                                                    image_size(path), path)))
     return Capture("COLMAP", source, tuple(frames))
 
@@ -75,18 +75,15 @@ def _image_folder(source: Path, model: Path) -> Path:
 
 
 def _camera_to_world(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    w, x, y, z = quaternion / max(np.linalg.norm(quaternion), 1e-12)
+    with np.errstate(all="ignore"):    # what is not finite is refused as a pose
+        w, x, y, z = quaternion / max(np.linalg.norm(quaternion), 1e-12)
     rotation = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
                          [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
                          [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
     return np.concatenate([rotation.T, -rotation.T @ translation[:, None]], axis=1)
 
 
-def _camera(model: str, width: int, height: int, p: np.ndarray, pose: np.ndarray, folder: Path,
-            name: str) -> Camera:
-    if not (np.isfinite(p).all() and p[0] > 0 and width > 0 and height > 0):
-        raise UserError(f"The camera of image '{name}' in '{folder}' has bad intrinsics ({model} "
-                        f"{p.tolist()}, {width} x {height}); run COLMAP again.")
+def _camera(model: str, width: int, height: int, p: np.ndarray, pose: np.ndarray) -> Camera:
     if model == "SIMPLE_PINHOLE":
         return Camera(width, height, p[0], p[0], p[1], p[2], pose)
     if model == "PINHOLE":

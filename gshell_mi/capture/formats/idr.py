@@ -14,7 +14,7 @@ from scipy.linalg import rq
 from ...errors import UserError
 from ..camera import Camera
 from ..decoding import image_size, images_in
-from ..frames import Capture, Frame, pose_of
+from ..frames import Capture, Frame, camera_for_image, pose_of
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 _FOLDERS = ("image", "images", "rgb")
@@ -83,7 +83,7 @@ def _camera(matrix: np.ndarray, image: Path, owner: str) -> Camera:
         raise UserError(f"The world_mat of {owner} has skewed pixels, which are not supported; resample its "
                         f"image.")
     pose = pose_of(np.concatenate([rotation.T, center[:, None]], axis=1), owner)
-    width, height = image_size(image)
+    size = image_size(image)
     # Half a pixel: from integer centres to corners at integers.
-    return Camera(width, height, intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2] + 0.5,
-                  intrinsic[1, 2] + 0.5, pose)
+    cx, cy = intrinsic[:2, 2] + 0.5
+    return camera_for_image(Camera(*size, intrinsic[0, 0], intrinsic[1, 1], cx, cy, pose), size, image)

@@ -56,8 +56,9 @@ def read(source: Path, images: Path | None = None) -> Capture:
         owner = f"image {index} of '{path}'"
         pose = pose_of(np.stack([right, down, -backward, center], axis=1), owner)
         height, width, focal = matrix[:, 4]
-        if not (np.isfinite(row).all() and min(height, width, focal) > 0):
-            raise UserError(f"The size or focal length of {owner} is not positive; export it again.")
+        if not np.isfinite(row).all():
+            raise UserError(f"The size, focal length or bounds of {owner} are NaN or infinite; export it "
+                            "again.")
         width, height = round(width), round(height)
         declared = Camera(width, height, focal, focal, width / 2, height / 2, pose)
         frames.append(Frame(image, camera_for_image(declared, image_size(image), image)))

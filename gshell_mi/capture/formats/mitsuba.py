@@ -45,6 +45,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
     """
     path = find(source)
     try:
+        path.read_text(encoding="utf-8")    # Mitsuba would take other bytes for names
         sensors = mi.load_file(str(path)).sensors()
     except Exception as error:
         reason = (str(error).strip().splitlines() or [repr(error)])[0]
