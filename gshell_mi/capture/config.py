@@ -48,7 +48,7 @@ class CaptureConfig:
     """Corners x0 y0 z0 x1 y1 z1 of the box that holds the object, in the scene's units; it grows to a cube.
     Default: around the volume that the masks have in common."""
     up: str = "auto"
-    """Which way of the capture is up: x, y, z, -x, -y, -z; cameras: the mean of theirs; keep: do not turn the
+    """Which way of the capture is up: x, y, z, -x, -y, -z; cameras: the mean of theirs; keep: do not move the
     world; auto: what the format says, else cameras."""
     resolution: int = 64
     """Cells per side of the lattice."""

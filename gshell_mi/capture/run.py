@@ -23,6 +23,9 @@ from .region import FLIPPED_AXES, find_box, likely_misreading
 from .trouble import Thumbnail, find_trouble
 from .writer import scene_xml, sensors_xml, staged, write_record, write_target
 
+#: An object farther from the origin than so many of its sizes is moved there.
+_FAR = 50.0
+
 
 @dataclass(frozen=True)
 class CaptureResult:
@@ -49,7 +52,7 @@ def import_capture(source: str | Path, output: str | Path, *, config: CaptureCon
 
     A Mitsuba ``llvm`` or ``cuda`` variant must be set. Writes ``output`` (an XML file) and beside it the
     folder of its stem: targets ``view_000.exr`` and so on, ``sensors.xml``, ``capture.json`` (which view is
-    which photograph, how the world was turned) and, if there are held-out views, ``test.xml`` with
+    which photograph, how the world was moved) and, if there are held-out views, ``test.xml`` with
     ``test/test_000.exr`` and so on. Either all of that or, on an error, nothing.
 
     Args:
@@ -122,6 +125,14 @@ class _Import:
             self.warnings.append(f"{len(empty)} {what} left out: {some}.")
         box = self._box(thumbnails)
         self.warnings += find_trouble(thumbnails, box, self.to_scene)
+        center, half = box.mean(axis=0), np.ptp(box, axis=0).max() / 2
+        if self.config.box is None and self.config.up != "keep" and np.linalg.norm(center) > _FAR * half:
+            # Geographic coordinates, say: single precision would leave little of the object.
+            shift = np.eye(4)
+            shift[:3, 3] = -center
+            self.to_scene, box = shift @ self.to_scene, box - center
+            cameras, tests = ({name: camera.moved(shift) for name, camera in group.items()}
+                              for group in (cameras, tests))
         (folder / "sensors.xml").write_text(sensors_xml(cameras, box), encoding="utf-8")
         if tests:
             (folder / "test.xml").write_text(sensors_xml(tests, box), encoding="utf-8")

@@ -166,6 +166,26 @@ def test_importing_the_package_sets_no_variant():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_geographic_coordinates_keep_their_precision(source, tmp_path):
+    """Half a million units away, where single precision resolves a thirtieth."""
+    shutil.copytree(source, tmp_path / "set")
+    away = np.array([500_000.0, 200_000.0, 80.0])
+    for name in ("transforms_train.json", "transforms_test.json"):
+        document = json.loads((tmp_path / "set" / name).read_text())
+        for frame in document["frames"]:
+            for axis in range(3):
+                frame["transform_matrix"][axis][3] += away[axis]
+        (tmp_path / "set" / name).write_text(json.dumps(document))
+    result = import_capture(tmp_path / "set", tmp_path / "s.xml")
+    assert result.warnings == () and np.abs(result.box.mean(axis=0)).max() < 1e-6
+    matrix = np.array(json.loads((tmp_path / "s" / "capture.json").read_text())["capture_to_scene"])
+    for file, cameras in ((tmp_path / "s.xml", MANY), (tmp_path / "s" / "test.xml", known_cameras(3))):
+        for sensor, truth in zip(mi.load_file(str(file)).sensors(), cameras, strict=True):
+            center = np.array(sensor.world_transform().matrix).reshape(4, 4)[:3, 3]
+            expected = matrix[:3, :3] @ (truth.origin + away) + matrix[:3, 3]
+            np.testing.assert_allclose(center, expected, atol=1e-5)
+
+
 # --- where the object is
 
 
