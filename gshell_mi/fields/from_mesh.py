@@ -2,35 +2,47 @@
 
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 import trimesh
+from scipy import ndimage
 from scipy.fft import dstn, idstn
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
+from .. import compat
 from ..errors import UserError
+from ..extraction import SurfaceMesh, extract
 from ..lattice import Lattice
+from ..topology import vertex_components
 from .lattice_fields import LatticeFields
+from .mesh_distance import Feet, MeshFeet, nearest_faces
 
 _BAND_CELLS = 3.0  # distances are exact and signs those of the nearest face this near the mesh
-# The mSDF is negative farther away than this, so that caps of the template are no surface. An edge that
-# crosses the mesh interpolates distances to at most sqrt(3) / 2 cells; one that leaves the band starts
-# at 3 - sqrt(3) at least.
-_SHEET_CELLS = 1.2
 # Past a rim the template goes on in the tangent plane for this long, so that the mSDF cuts it cleanly.
 _RIM_CELLS = 2.0
+# A point of the template is on the mesh if it is this near and faces the same way. An edge that crosses
+# the mesh is at most sqrt(3) cells long, and its crossing is found to a fraction of it.
+_ON_MESH_CELLS = 0.75
+_SAME_WAY = -0.5
+_SIGN_ROUNDS = 12  # of fitting the mSDF, each with more weight on what has the wrong sign
+_DAMPING = 1e-2  # weight of the start of the fit, so that it has one solution
+_SPECK = 12  # patches of fewer vertices have the wrong sign
+_UNEXPLAINED = 0.02  # as have those of a smaller fraction of the template's vertices and far from any rim
 
 
 def from_mesh(
     source: str | Path | trimesh.Trimesh, lattice: Lattice, *, to_world: np.ndarray | None = None
 ) -> LatticeFields:
-    """Fields whose surface is the mesh, to the accuracy of the lattice.
+    """Fields whose surface is the mesh, to the accuracy of the lattice. Needs a Mitsuba variant to be set.
 
     Near the mesh ``sdf`` is the distance to it, signed by the pseudonormal of the nearest point (Baerentzen
-    and Aanaes 2005). Farther away, and across openings, it is that of the indicator function whose
-    gradient is the mesh's normals (Kazhdan et al. 2006, solved on the lattice), which caps the openings.
-    ``msdf`` is the distance to the rims along the mesh, negative where the nearest point of the mesh lies
-    on a rim, and negative on the caps. An open mesh must be consistently oriented; layers closer to each
-    other than about two cells run into each other.
+    and Aanaes 2005). Farther away, and across openings, the sign is that of the generalised winding number
+    (Jacobson et al. 2013) as a harmonic function on the lattice that jumps by 1 across the mesh, which caps
+    the openings. ``msdf`` is fitted, at the vertices of the template that results, to the distance to the
+    rims along the mesh, negative past them and on the caps. An open mesh must be consistently oriented;
+    layers closer to each other than about two cells run into each other.
 
     Args:
         source: a file that trimesh reads, or a mesh.
@@ -56,31 +68,30 @@ def from_mesh(
             "cells must stay free; enlarge to_world"
         )
     points = lattice.vertex_positions().astype(float)
-    count = int(np.clip(6 * mesh.area / h**2, 20_000, 1_000_000))
-    samples, sample_faces = trimesh.sample.sample_surface(mesh, count, seed=0)
-    tree = cKDTree(samples)
-    distance, _ = tree.query(points)
+    feet_of = MeshFeet(mesh)
+    band, face = nearest_faces(mesh, lattice, _BAND_CELLS * h)
+    feet = feet_of(points[band], face[:, None])
 
-    band = np.flatnonzero(distance < _BAND_CELLS * h)
-    closest, height, on_rim = _nearest(mesh, tree, sample_faces, points[band])
-    band_distance = np.linalg.norm(points[band] - closest, axis=1)
-    distance[band] = band_distance
-    sdf = _indicator_distance(lattice, samples, mesh.face_normals[sample_faces] * mesh.area / count)
-    sdf = np.clip(sdf, -distance, distance)
-    sdf[band] = np.where(on_rim, sdf[band], np.where(height < 0, -band_distance, band_distance))
-    beside_rim = on_rim & (band_distance < _RIM_CELLS * h)
-    sdf[band[beside_rim]] = height[beside_rim]
+    far = _far_distance(lattice, points, band, feet)
+    sdf = np.where(_winding_number(lattice, mesh) > 0.5, -far, far)
+    near = np.where(feet.height < 0, -feet.distance, feet.distance)
+    near[feet.on_rim] = np.copysign(feet.distance, sdf[band])[feet.on_rim]
+    beside_rim = feet.on_rim & (feet.distance < _RIM_CELLS * h)
+    near[beside_rim] = feet.height[beside_rim]
+    sdf[band] = near
+    if not mesh.is_watertight:
+        _separate_layers(sdf, mesh, lattice, band)
     border = np.abs(points).max(axis=1) > 1 - h / 2
-    sdf[border] = np.maximum(distance, h / 2)[border]  # the template closes inside the lattice
+    sdf[border] = np.maximum(np.abs(sdf), h / 2)[border]  # the template closes inside the lattice
 
-    rim = _rim_samples(mesh, h / 8)
+    fields = LatticeFields.closed(sdf, lattice.grid)
+    rim = feet_of.rim_samples(h / 8)
     if len(rim) == 0:
-        return LatticeFields.closed(sdf, lattice.grid)
-    msdf = _SHEET_CELLS * h - distance
-    rim_distance, _ = cKDTree(rim).query(closest)  # along the surface: 0 where its side ends
-    msdf[band] = np.minimum(msdf[band], np.where(on_rim, -band_distance, rim_distance))
-    closed = LatticeFields.closed(sdf)
-    return LatticeFields(closed.sdf, msdf.astype(np.float32), closed.deform, lattice.grid)
+        return fields
+    nearest = np.full(lattice.vertex_count, -1)
+    nearest[band] = face
+    msdf = _fitted_msdf(fields, feet_of, nearest, rim)
+    return LatticeFields(fields.sdf, msdf, fields.deform, lattice.grid)
 
 
 def _load(source: str | Path | trimesh.Trimesh, name: str) -> trimesh.Trimesh:
@@ -100,67 +111,169 @@ def _load(source: str | Path | trimesh.Trimesh, name: str) -> trimesh.Trimesh:
     return mesh
 
 
-def _nearest(
-    mesh: trimesh.Trimesh, tree: cKDTree, sample_faces: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The nearest points of the mesh, the heights above their tangent planes, and which lie on a rim."""
-    _, index = tree.query(points, k=8)
-    candidates = sample_faces[index]
-    triangles = mesh.triangles[candidates.ravel()]
-    closest = trimesh.triangles.closest_point(triangles, np.repeat(points, 8, axis=0)).reshape(-1, 8, 3)
-    best = np.linalg.norm(closest - points[:, None], axis=2).argmin(axis=1)
-    rows = np.arange(len(points))
-    closest, face = closest[rows, best], candidates[rows, best]
-
-    weights = trimesh.triangles.points_to_barycentric(mesh.triangles[face], closest)
-    vanishing = weights < 1e-4
-    corners = mesh.faces[face]
-    normal = mesh.face_normals[face].copy()
-    rim_vertices, rim_edges = _rim(mesh)
-    on_rim = np.zeros(len(points), bool)
-    for i in range(3):
-        on_edge = vanishing[:, i] & (vanishing.sum(axis=1) == 1)  # the edge opposite to corner i
-        edge = np.sort(corners[:, [(i + 1) % 3, (i + 2) % 3]], axis=1)
-        normal[on_edge] = _edge_normals(mesh, edge[on_edge])
-        on_rim |= on_edge & np.isin(edge @ [len(mesh.vertices), 1], rim_edges @ [len(mesh.vertices), 1])
-        at_corner = ~vanishing[:, i] & (vanishing.sum(axis=1) == 2)
-        normal[at_corner] = mesh.vertex_normals[corners[at_corner, i]]
-        on_rim |= at_corner & np.isin(corners[:, i], rim_vertices)
-    height = np.einsum("ij,ij->i", points - closest, normal) / np.linalg.norm(normal, axis=1)
-    return closest, height, on_rim
+def _far_distance(lattice: Lattice, points: np.ndarray, band: np.ndarray, feet: Feet) -> np.ndarray:
+    """Distances of all lattice vertices to the foot of the nearest vertex beside the mesh."""
+    beside = feet.distance < lattice.spacing
+    away = np.ones(lattice.vertex_count, bool)
+    away[band[beside]] = False
+    shape = (lattice.stride,) * 3
+    index = ndimage.distance_transform_edt(away.reshape(shape), return_distances=False, return_indices=True)
+    foot = np.zeros((lattice.vertex_count, 3))
+    foot[band] = feet.point
+    return np.linalg.norm(points - foot[np.ravel_multi_index(tuple(index), shape).ravel()], axis=1)
 
 
-def _edge_normals(mesh: trimesh.Trimesh, edges: np.ndarray) -> np.ndarray:
-    """Sum of the normals of the faces at each of the given (sorted) edges."""
-    size = len(mesh.vertices)
-    keys, inverse = np.unique(mesh.edges_sorted @ [size, 1], return_inverse=True)
-    sums = np.zeros((len(keys), 3))
-    np.add.at(sums, inverse, mesh.face_normals[mesh.edges_face])
-    return sums[np.searchsorted(keys, edges @ [size, 1])]
+def _separate_layers(sdf: np.ndarray, mesh: trimesh.Trimesh, lattice: Lattice, band: np.ndarray) -> None:
+    """Turns the sign of vertices so that layers with no vertex between them stay apart, in place.
+
+    An edge of the lattice that crosses the mesh twice has ends of one sign. The end nearer to the middle
+    between the crossings takes the other sign, which moves the layer in front of it by half an edge at most.
+    """
+    import mitsuba as mi
+
+    vertices, faces = _beyond_rims(mesh, lattice.spacing)
+    scene = mi.load_dict({"type": "scene", "mesh": compat.triangle_mesh("mesh", vertices, faces)})
+    inner = band[(np.abs(lattice.vertex_positions()[band]) < 1 - 1.5 * lattice.spacing).all(axis=1)]
+    spacing = lattice.spacing
+    flips = []
+    for difference in range(1, 8):
+        step = np.array([difference & 1, difference >> 1 & 1, difference >> 2 & 1])
+        other = inner + step @ [1, lattice.stride, lattice.stride**2]
+        alike = (sdf[inner] < 0) == (sdf[other] < 0)
+        a, b = inner[alike], other[alike]
+        hits = []
+        for start, way in ((a, 1), (b, -1)):
+            origin = lattice.positions_of(mi.UInt32(start.astype(np.uint32)), mi.Float)
+            ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(*(way * step * spacing).tolist()))
+            ray.maxt = mi.Float(1)
+            hits.append(scene.ray_intersect_preliminary(ray).t.numpy())
+        twice = np.isfinite(hits[0]) & np.isfinite(hits[1]) & (hits[0] < 1 - hits[1] - 1e-3)
+        flips.append(np.where(hits[0] <= hits[1], a, b)[twice])
+    flipped = np.unique(np.concatenate(flips))
+    depth = np.abs(sdf[flipped]).clip(1e-3 * spacing, 0.1 * spacing)
+    sdf[flipped] = np.where(sdf[flipped] < 0, depth, -depth)
 
 
-def _rim(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and (sorted) edges with a face on one side only."""
-    edges = mesh.edges_sorted[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
-    edges = edges.reshape(-1, 2)
-    return np.unique(edges), edges
+def _beyond_rims(mesh: trimesh.Trimesh, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of the mesh, continued past its rims in the tangent plane."""
+    single = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
+    a, b = mesh.edges[single].T
+    along = mesh.vertices[b] - mesh.vertices[a]
+    outward = np.cross(along, mesh.face_normals[mesh.edges_face[single]])
+    direction = np.zeros((len(mesh.vertices), 3))
+    for end in (a, b):
+        np.add.at(direction, end, outward)
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
+    rim, local = np.unique([a, b], return_inverse=True)
+    c, d = local.reshape(2, -1) + len(mesh.vertices)
+    strips = np.concatenate([np.stack([b, a, c], axis=1), np.stack([b, c, d], axis=1)])
+    beyond = mesh.vertices[rim] + width * direction[rim]
+    return np.concatenate([mesh.vertices, beyond]), np.concatenate([mesh.faces, strips])
 
 
-def _rim_samples(mesh: trimesh.Trimesh, spacing: float) -> np.ndarray:
-    """Points along the rims, no farther apart than ``spacing``."""
-    start, end = (mesh.vertices[_rim(mesh)[1][:, i]] for i in (0, 1))
-    steps = np.ceil(np.linalg.norm(end - start, axis=1) / spacing).astype(int) + 1
-    edge = np.repeat(np.arange(len(start)), steps)
-    t = (np.arange(len(edge)) - np.repeat(np.cumsum(steps) - steps, steps)) / np.repeat(steps, steps)
-    return start[edge] + t[:, None] * (end - start)[edge]
+def _fitted_msdf(
+    fields: LatticeFields, feet_of: MeshFeet, nearest: np.ndarray, rim: np.ndarray
+) -> np.ndarray:
+    """The mSDF whose interpolation at the vertices of the template is nearest to the distance to the rims.
+
+    Args:
+        nearest: the face nearest to each lattice vertex, -1 where it is far.
+        rim: samples of the rims, (n, 3).
+    """
+    import mitsuba as mi
+
+    lattice = fields.lattice
+    template = extract(lattice, mi.Float(fields.sdf))
+    edges = template.to_numpy()[1][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    wanted, beside_rim = _rim_distance(template, lattice, feet_of, nearest, rim, edges)
+    entries = [tuple(np.array(x) for x in entry) for entry in dr.detach(template.stencil.entries())]
+    row, column, weight = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+    used, column = np.unique(column, return_inverse=True)
+    interpolate = coo_array((weight, (row, column)), shape=(template.vertex_count, len(used))).tocsr()
+    # The least change of the mean of what the lattice vertex takes part in.
+    share = interpolate.T @ np.ones(template.vertex_count)
+    start = (interpolate.T @ wanted) / share
+    importance = np.ones(template.vertex_count)
+    values = start
+    for _ in range(_SIGN_ROUNDS):
+        normal = interpolate.T @ diags_array(importance) @ interpolate + _DAMPING * diags_array(share)
+        right = interpolate.T @ (importance * wanted) + _DAMPING * share * start
+        jacobi = diags_array(1 / normal.diagonal())
+        values, _ = cg(normal.tocsr(), right, x0=values, rtol=1e-4, maxiter=150, M=jacobi)
+        found = interpolate @ values
+        patch = _patches(found > 0, edges)
+        speck = (np.bincount(patch) < _SPECK)[patch]
+        # Where caps and layers share lattice vertices, caps prevail at the rims, so that these do not run
+        # into each other, and the mesh elsewhere. Nothing small is left over.
+        missed = ((found > 0) != (wanted > 0)) & (beside_rim != (wanted > 0))
+        if not speck.any() and not missed.any():
+            break
+        importance[missed] *= 8
+        wanted[speck] = np.where(found[speck] > 0, -0.25, 0.25) * lattice.spacing
+        importance[speck] *= 8
+    for _ in range(_SIGN_ROUNDS):  # what the fit could not remove goes by force
+        found = interpolate @ values
+        patch = _patches(found > 0, edges)
+        speck = np.flatnonzero((np.bincount(patch) < _SPECK)[patch])
+        if len(speck) == 0:
+            break
+        ends = interpolate[speck].tocoo()
+        turned = np.copysign(0.1 * lattice.spacing, -found[speck])
+        values[ends.coords[1]] = turned[ends.coords[0]]
+    msdf = np.full(lattice.vertex_count, -lattice.spacing, np.float32)
+    msdf[used] = values
+    return msdf
 
 
-def _indicator_distance(lattice: Lattice, samples: np.ndarray, area_normals: np.ndarray) -> np.ndarray:
-    """Signed distance to the level 1/2 of the indicator function, to first order.
+def _rim_distance(
+    template: SurfaceMesh, lattice: Lattice, feet_of: MeshFeet, nearest: np.ndarray, rim: np.ndarray,
+    edges: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distance to the rims along the mesh at the vertices of the template, and which are near one."""
+    h = lattice.spacing
+    vertices = template.to_numpy()[0]
+    normals = np.array(dr.detach(template.vertex_normals())).T
+    low = np.clip(np.floor((vertices + 1) / h).astype(int), 0, lattice.resolution - 1)
+    corners = low @ [1, lattice.stride, lattice.stride**2]
+    corners = corners[:, None] + np.array(
+        [x + lattice.stride * (y + lattice.stride * z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]
+    )
+    candidates = nearest[corners]
+    known = (candidates >= 0).any(axis=1)
+    candidates = np.where(candidates >= 0, candidates, candidates.max(axis=1, keepdims=True))
+    feet = feet_of(vertices[known].astype(float), candidates[known])
+    inner = cKDTree(rim).query(feet.point)[0]
+    on_mesh = (feet.distance < _ON_MESH_CELLS * h) & ((feet.normal * normals[known]).sum(axis=1) > _SAME_WAY)
+    wanted = np.full(len(vertices), -2 * h)
+    past = -np.maximum(feet.distance, h / 4)
+    wanted[known] = np.where(feet.on_rim, -feet.distance, np.where(on_mesh, inner, past))
+    wanted = np.clip(wanted, -2 * h, 2 * h)
+    beside_rim = np.zeros(len(vertices), bool)
+    beside_rim[known] = inner < 2 * h
+    for _ in range(2):
+        # What no rim explains comes from layers that the lattice cannot tell apart, or from a crease.
+        patch = _patches(wanted > 0, edges)
+        size, explained = np.bincount(patch), np.bincount(patch, beside_rim) > 0
+        wanted[((size < _SPECK) | (~explained & (size < _UNEXPLAINED * len(wanted))))[patch]] *= -1
+    return np.copysign(np.maximum(np.abs(wanted), 1e-3 * h), wanted), beside_rim
 
-    Solves laplace(chi) = -div(n delta) with chi = 0 on the border of the lattice.
+
+def _patches(positive: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """The connected patch of one sign that each vertex belongs to."""
+    alike = positive[edges[:, 0]] == positive[edges[:, 1]]
+    return vertex_components(edges[alike], len(positive))[1]
+
+
+def _winding_number(lattice: Lattice, mesh: trimesh.Trimesh) -> np.ndarray:
+    """The generalised winding number w at the lattice vertices, blurred by about a cell.
+
+    It is harmonic but for its jump across the mesh: laplace(w) = -div(n delta)
+    (Barill et al. 2018, sec. 2), solved on the lattice with w = 0 on its border, as by Kazhdan et al. (2006).
     """
     n, h = lattice.stride, lattice.spacing
+    count = int(np.clip(6 * mesh.area / h**2, 20_000, 1_000_000))
+    samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+    area_normals = mesh.face_normals[faces] * mesh.area / count
     cell = (samples + 1) / h
     low = np.clip(np.floor(cell).astype(int), 0, n - 2)
     fraction = cell - low
@@ -173,11 +286,10 @@ def _indicator_distance(lattice: Lattice, samples: np.ndarray, area_normals: np.
     density = density.reshape(n, n, n, 3) / h**3  # indexed [z, y, x]
     divergence = sum(np.gradient(density[..., axis], h, axis=2 - axis) for axis in range(3))
     if n < 3:
-        return np.full(n**3, np.inf)
+        return np.zeros(n**3)
     inner = slice(1, -1)
     eigenvalue = (2 - 2 * np.cos(np.pi * np.arange(1, n - 1) / (n - 1))) / h**2
     total = eigenvalue[:, None, None] + eigenvalue[:, None] + eigenvalue
-    chi = np.zeros((n, n, n))
-    chi[inner, inner, inner] = idstn(dstn(divergence[inner, inner, inner], type=1) / total, type=1)
-    slope = np.sqrt(sum(g**2 for g in np.gradient(chi, h)))
-    return ((0.5 - chi) / np.maximum(slope, 1e-6)).ravel()
+    winding = np.zeros((n, n, n))
+    winding[inner, inner, inner] = idstn(dstn(divergence[inner, inner, inner], type=1) / total, type=1)
+    return winding.ravel()

@@ -10,7 +10,7 @@ from topology import assert_manifold, component_count, euler_characteristic, loo
 from gshell_mi import UserError
 from gshell_mi.extraction import extract
 from gshell_mi.fields import from_mesh
-from gshell_mi.lattice import TetLattice
+from gshell_mi.lattice import GRIDS, TetLattice, make_lattice
 
 LATTICE = TetLattice(32)
 
@@ -84,6 +84,40 @@ def test_surface_is_reproduced(name):
     nearest = cKDTree(mesh.triangles_center).query(surface.to_trimesh().triangles_center)[1]
     agreement = np.einsum("ij,ij->i", mesh.face_normals[nearest], surface.to_trimesh().face_normals)
     assert np.mean(agreement > 0) > 0.98
+
+
+def _fold(gap):
+    """Two parallel sheets with a gap between them, joined along one side by a half cylinder."""
+
+    def point(u, v):
+        along = (u - 0.5) * (1.6 + np.pi * gap / 2)
+        straight, angle = np.clip(np.abs(along) - np.pi * gap / 4, 0, None), along / (gap / 2)
+        angle = np.clip(angle, -np.pi / 2, np.pi / 2)
+        return straight - 0.4 - gap / 2 * np.cos(angle), gap / 2 * np.sin(angle) + 0.01, v - 0.5
+
+    return _grid(point, False, rows=24, columns=400)
+
+
+@pytest.mark.parametrize("gap", [0.6, 1.5])
+def test_layers_closer_than_a_cell_stay_apart(gap):
+    mesh = _fold(gap * LATTICE.spacing)
+    assert (loop_count(mesh.faces), mesh.euler_number) == (1, 1)
+    for turned in (False, True):  # the gap is outside, or inside
+        if turned:
+            mesh.invert()
+        fields = from_mesh(mesh, LATTICE)
+        _, faces, _ = extract(LATTICE, mi.Float(fields.sdf), mi.Float(fields.msdf)).to_numpy()
+        assert (loop_count(faces), component_count(faces), euler_characteristic(faces)) == (1, 1, 1)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_every_grid(grid):
+    lattice = make_lattice(grid, 32)
+    mesh, loops, chi = SURFACES["deep bowl"]
+    fields = from_mesh(mesh, lattice)
+    assert fields.grid == grid
+    _, faces, _ = extract(lattice, mi.Float(fields.sdf), mi.Float(fields.msdf)).to_numpy()
+    assert (loop_count(faces), euler_characteristic(faces)) == (loops, chi)
 
 
 def test_inside_out_solid_is_turned():
