@@ -26,6 +26,8 @@ class CaptureConfig:
     masks: Path | None = None
     """Folder of masks, white on the object, named like the images; default: "masks" or "mask" if there is
     one, else alpha."""
+    invert_masks: bool = False
+    """The mask images are black on the object instead of white."""
     background: str | None = None
     """Colour behind the object that makes the masks: white, black, '#00ff00' ..."""
     background_tolerance: float = 0.1

@@ -115,10 +115,14 @@ def _match(folder: Path, image: Path) -> Path | None:
     return None
 
 
-def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None) -> np.ndarray:
+def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None = None, *,
+                inverted: bool = False) -> np.ndarray:
     """(h, w) coverage in [0, 1] of a frame with the given stored pixels.
 
     A given background colour comes first, then the frame's mask, then alpha.
+
+    Args:
+        inverted: mask files are black on the object.
 
     Raises:
         UserError: there is none of them, or the mask has another size than the image.
@@ -133,7 +137,8 @@ def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None)
         # Some tools put the mask into alpha and leave the colour empty or as it was.
         in_alpha = mask.shape[2] == 4 and _unit(mask[..., 3]).min() < 1
         values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
-        return np.clip(_unit(values, mask.dtype), 0, 1)
+        coverage = np.clip(_unit(values, mask.dtype), 0, 1)
+        return 1 - coverage if inverted else coverage
     if pixels.shape[2] < 4:
         raise UserError(f"Image '{frame.image}' has no alpha, and there is no mask for it; {_SUPPLY}.")
     alpha = np.clip(_unit(pixels[..., 3]), 0, 1)

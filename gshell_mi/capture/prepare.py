@@ -42,12 +42,14 @@ class Preparation:
     Attributes:
         decoding: from stored values to linear Rec.709.
         background: the colour behind the object, if that is to make the masks.
+        inverted_masks: mask files are black on the object.
         max_size: longest side of a target in pixels; 0 keeps the images' size.
         gains: factor on a file's linear values that evens out its exposure; 1 where not named.
     """
 
     decoding: ColorDecoding = field(default_factory=ColorDecoding)
     background: Background | None = None
+    inverted_masks: bool = False
     max_size: int = 0
     gains: dict[Path, float] = field(default_factory=dict)
 
@@ -58,7 +60,7 @@ class Preparation:
             UserError: the image or its mask cannot be used.
         """
         pixels = read_pixels(frame.image)
-        coverage = coverage_of(frame, pixels, self.background)[..., None]
+        coverage = coverage_of(frame, pixels, self.background, inverted=self.inverted_masks)[..., None]
         rgb = self.decoding.linear(pixels[..., :3])
         # In place, for a photograph of 24 megapixels takes 300 MB by now.
         if self.background is not None:

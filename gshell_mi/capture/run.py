@@ -91,7 +91,7 @@ class _Import:
         self.capture = replace(capture, frames=tuple(
             replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames))
         gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
-        self.preparation = Preparation(decoding, background, config.max_size, gains)
+        self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains)
         self.warnings: list[str] = []
 
     def write(self, partial: Path) -> CaptureResult:

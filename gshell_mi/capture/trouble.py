@@ -67,7 +67,7 @@ def find_trouble(thumbnails: list[Thumbnail], box: np.ndarray, to_scene: np.ndar
     inverted = [t for t in seen if _is_inverted(t.rgba[..., 3])]
     if inverted:
         found.append(f"The masks of {_names(inverted)} seem inverted: they cover the border, not the middle; "
-                     f"coverage is 1 (white) on the object.")
+                     f"coverage is 1 (white) on the object; --invert-masks reads them the other way round.")
     full = [t for t in seen if t.rgba[..., 3].min() >= 0.5]
     if full:
         found.append(f"The masks of {_names(full)} cover the whole image, so they say nothing of the "

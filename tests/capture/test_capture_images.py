@@ -105,7 +105,8 @@ def test_masks_of_every_kind(kind, tmp_path):
     else:
         mi.Bitmap((mask / np.float32(255))[..., None]).write(str(path))
     frame = Frame(Path("unused"), camera(), mask=path)
-    np.testing.assert_allclose(coverage_of(frame, RGBA, None), mask / 255, atol=1e-5)
+    np.testing.assert_allclose(coverage_of(frame, RGBA), mask / 255, atol=1e-5)
+    np.testing.assert_allclose(coverage_of(frame, RGBA, inverted=True), 1 - mask / 255, atol=1e-5)
 
 
 def test_a_mask_overrules_alpha(tmp_path):
@@ -259,4 +260,4 @@ def test_errors_name_what_to_supply(tmp_path):
     (tmp_path / "masks").rmdir()
     frame = read_capture(tmp_path).frames[0]
     with pytest.raises(UserError, match=r"'masks' beside the images or with --masks, or .* --background"):
-        coverage_of(frame, read_pixels(frame.image), None)
+        coverage_of(frame, read_pixels(frame.image))
