@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import io
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +11,7 @@ from types import ModuleType
 
 import mitsuba as mi
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageCms
 from skimage.io import imread
 
 from ..errors import UserError
@@ -180,6 +181,18 @@ def _known(name: str, names: object, option: str, what: str) -> None:
         near = difflib.get_close_matches(name, list(names), n=1, cutoff=0.3) or sorted(names)[:1]
         raise UserError(f"{option} '{name}' is no {what} that colour-science knows; the nearest that it "
                         f"knows is '{near[0]}'.")
+
+
+def color_profile(path: Path) -> str | None:
+    """The name of the colour profile (ICC) in an integer file; None if it has none."""
+    if path.suffix.lower() in FLOAT_SUFFIXES:
+        return None
+    try:
+        with Image.open(path) as image:
+            profile = image.info.get("icc_profile")
+        return ImageCms.getProfileDescription(io.BytesIO(profile)).strip() if profile else None
+    except (OSError, SyntaxError, ValueError, ImageCms.PyCMSError):
+        return None
 
 
 def exif_exposure(path: Path) -> float | None:

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import UserError
 from .camera import Camera
 from .config import AXES, CaptureConfig
-from .decoding import ColorDecoding
+from .decoding import ColorDecoding, color_profile
 from .formats import read_capture
 from .frames import Capture, Frame
 from .masks import Background, assign_masks
@@ -92,7 +92,7 @@ class _Import:
             replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames))
         gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
         self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains)
-        self.warnings: list[str] = []
+        self.warnings = _profile_warning(capture, config)
 
     def write(self, partial: Path) -> CaptureResult:
         folder = partial / self.output.stem
@@ -192,6 +192,17 @@ class _Import:
         return {"format": self.capture.format, "source": str(self.capture.source),
                 "capture_to_scene": self.to_scene.tolist(), "box": box.tolist(), "options": options,
                 "warnings": self.warnings, "views": views}
+
+
+def _profile_warning(capture: Capture, config: CaptureConfig) -> list[str]:
+    """If the photographs say that they are not sRGB, and nobody else has said anything."""
+    if (config.color_space, config.transfer) != ("sRGB", None):
+        return []
+    profile = color_profile(capture.training[0].image)
+    if profile is None or "srgb" in profile.lower():
+        return []
+    return [f"The photographs carry the colour profile '{profile}', but are read as sRGB: name their colour "
+            f"space with --color-space."]
 
 
 def to_scene(capture: Capture, up: str) -> np.ndarray:

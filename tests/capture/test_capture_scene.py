@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from known_capture import BALL, RADIUS, KnownCamera, known_cameras, write_image, write_nerf
-from PIL import Image
+from PIL import Image, ImageCms
 
 from gshell_mi.capture import Camera, CaptureConfig, import_capture
 from gshell_mi.capture.__main__ import main
@@ -158,6 +158,18 @@ def test_views_with_empty_masks_are_left_out(source, tmp_path):
     result = import_capture(tmp_path / "set", tmp_path / "s.xml")
     assert result.training == 19
     assert "1 view with an empty mask is left out: r_7.png." in result.warnings
+
+
+def test_another_colour_profile_is_noticed(source, tmp_path):
+    shutil.copytree(source, tmp_path / "set")
+    first = tmp_path / "set/train/r_0.png"
+    for name, words in (("sRGB", None), ("XYZ", "carry the colour profile 'XYZ")):
+        profile = ImageCms.ImageCmsProfile(ImageCms.createProfile(name)).tobytes()
+        Image.open(first).save(first, icc_profile=profile)
+        result = import_capture(tmp_path / "set", tmp_path / "s.xml", overwrite=True)
+        assert [words in warning for warning in result.warnings] == ([True] if words else [])
+    told = CaptureConfig(color_space="ITU-R BT.709")
+    assert import_capture(tmp_path / "set", tmp_path / "t.xml", config=told).warnings == ()
 
 
 def test_importing_the_package_sets_no_variant():
