@@ -25,7 +25,7 @@ class GradientScene:
     about: str                  #: what it shows
     build: Callable             #: resolution in pixels -> (scene, motion of the vertices, V x 3)
     depth: int = 2              #: path length (``max_depth``)
-    step: float = 0.02          #: of the finite differences, in units of the parameter
+    step: float = 0.08          #: of the finite differences, in units of the parameter
     hide_emitters: bool = True
 
 
@@ -190,7 +190,7 @@ def _seam_over_mirror(resolution):
         "type": "roughconductor", "alpha": 0.3, "material": "Al"}}, smooth=False)
     texture = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": chequers()}}
     return (load(camera(resolution, (0, 3, 4.5), (0, 0.5, 0)), constant(),
-                 make_mesh("subject", v, f, texture, uv=uv), mirror=mirror), translation(v))
+                 make_mesh("subject", v, f, texture, uv=uv), mirror=mirror), translation(v, (0.3, 1, -0.3)))
 
 
 def _seam_self_shadowed(resolution):
@@ -206,6 +206,12 @@ def _textured_light(resolution):
     light = {"type": "rectangle", "to_world": to_world,
              "emitter": {"type": "area", "radiance": {**chequers(4)}}}
     return load(camera(resolution), light, make_mesh("subject", v, f)), translation(v)
+
+
+def _coarse(resolution):
+    v, f = sphere(1, 0.8)
+    return (load(camera(resolution), _point_light([1.5, 2.5, 2.5]), make_mesh("subject", v, f)),
+            translation(v))
 
 
 def _frame(sample_border, **film):
@@ -239,19 +245,21 @@ def _open_box(resolution):
 def _thin_sheet(resolution):
     v, f = sheet()
     v = v[:, [2, 1, 0]]
-    return (load(camera(resolution, (0.25, 0.5, 5)), constant(), make_mesh("subject", v, f)), translation(v))
+    return (load(camera(resolution, (0.4, 0.5, 5)), constant(), make_mesh("subject", v, f)), translation(v))
 
 
 def _shadow_on_plane(light):
     def build(resolution):
         v, f = sphere(3, 0.5, (0.3, 0.8, 0))
-        return (load(camera(resolution, (0.2, 6, 4)), light(), make_mesh("subject", v, f),
+        # Darker than the plane: else the object and its shadow nearly cancel
+        dark = diffuse(0.1, 0.15, 0.2)
+        return (load(camera(resolution, (0.2, 6, 4)), light(), make_mesh("subject", v, f, dark),
                      plane=make_mesh("plane", *plane(), smooth=False)), translation(v))
     return build
 
 
-def _point_light():
-    return {"type": "point", "position": [2, 4, 1], "intensity": {"type": "rgb", "value": [16.0] * 3}}
+def _point_light(position=(2, 4, 1)):
+    return {"type": "point", "position": list(position), "intensity": {"type": "rgb", "value": [16.0] * 3}}
 
 
 def _area_light():
@@ -271,12 +279,13 @@ SCENES = (
     GradientScene("seam_over_rough_mirror", "texture seam over a rough mirror (#1648)", _seam_over_mirror, 3),
     GradientScene("seam_self_shadowed", "texture seam, self-shadowed (#1648)", _seam_self_shadowed),
     GradientScene("textured_area_light", "spatially varying emitter (#1506)", _textured_light),
+    GradientScene("coarse_shading_rim", "coarse mesh, normals turned away at the silhouette", _coarse),
     GradientScene("border_sampled", "sample_border, object at the frame (#1954)", _frame(True)),
     GradientScene("leaving_the_frame", "object leaving the frame", _frame(False)),
     GradientScene("box_filter", "box reconstruction filter", _box_filter),
     GradientScene("occluder", "static occluder in front", _occluder),
     GradientScene("open_box", "interreflection in an open box", _open_box, 3),
-    GradientScene("thin_sheet_edge_on", "sheet seen almost from its edge", _thin_sheet, step=0.01),
+    GradientScene("thin_sheet_edge_on", "sheet seen almost from its edge", _thin_sheet, step=0.06),
     GradientScene("shadow_environment", "shadow on a plane, environment", _shadow_on_plane(constant)),
     GradientScene("shadow_area_light", "shadow on a plane, area light", _shadow_on_plane(_area_light)),
     GradientScene("shadow_point_light", "hard shadow, point light", _shadow_on_plane(_point_light)),
@@ -326,15 +335,12 @@ def reverse_derivative(mover, integrator, spp, seed, weights) -> float:
     return float(dr.grad(t)[0])
 
 
-def finite_differences(mover, case, spp, repeats) -> np.ndarray:
-    """Central differences of stock renderings with equal seeds, repeats x H x W x 4."""
+def finite_difference(mover, case, step, spp, seed) -> np.ndarray:
+    """Central difference of two stock renderings with equal seeds, H x W x 4."""
     integrator = mi.load_dict({"type": "path", "max_depth": case.depth, "hide_emitters": case.hide_emitters})
-    results = []
-    for seed in range(repeats):
-        images = []
-        for t in (case.step, -case.step):
-            mover.to(mi.Float(t))
-            images.append(np.array(mi.render(mover.scene, integrator=integrator, spp=spp, seed=1000 + seed)))
-        results.append((images[0] - images[1]) / (2 * case.step))
+    images = []
+    for t in (step, -step):
+        mover.to(mi.Float(t))
+        images.append(np.array(mi.render(mover.scene, integrator=integrator, spp=spp, seed=1000 + seed)))
     mover.to(mi.Float(0))
-    return np.array(results)
+    return (images[0] - images[1]) / (2 * step)

@@ -29,11 +29,12 @@ class EdgeWedges:
     low: object         #: ``Float``: lowest angle of a face, above -pi
     high: object        #: ``Float``: highest angle of a face, below pi
     crease: object      #: ``Bool``: whether the film warp follows it wherever it is seen
+    meshes: int         #: how many meshes have edges
+    mesh_mass: object   #: ``Float``: sum of length times opening over the edges of its mesh
 
     def opening(self):
         """Width in radians of each lune."""
-        width = dr.pi - (self.high - self.low)
-        return dr.select(width > _FLAT, width, 0)
+        return dr.pi - (self.high - self.low)
 
     def frame(self, index):
         """Of edges by index: end points, unit axis, and the unit vectors at angles 0 and 90 degrees."""
@@ -71,7 +72,8 @@ def build_edge_wedges(tables, crease_angle=10.0):
         return None
     with dr.resume_grad():
         positions = join(buffers)
-    return EdgeWedges(positions, *(join([part[k] for part in parts]) for k in range(len(parts[0]))))
+    columns = [join([part[k] for part in parts]) for k in range(len(parts[0]))]
+    return EdgeWedges(positions, *columns[:-1], len(parts), columns[-1])
 
 
 def _mesh_wedges(mesh, table, crease_angle, offset):
@@ -102,7 +104,11 @@ def _mesh_wedges(mesh, table, crease_angle, offset):
         return None
     start, end, opposite, low, high, crease = (
         dr.gather(type(x), x, keep) for x in (table.start, table.end, opposite, low, high, crease))
-    result = [start + offset, end + offset, opposite + offset, low, high, crease]
+    p, q = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
+    mass = dr.sum(dr.norm(q - p) * (dr.pi - (high - low)))
+    dr.make_opaque(mass)
+    result = [start + offset, end + offset, opposite + offset, low, high, crease,
+              mass + dr.zeros(mi.Float, dr.width(keep))]
     dr.eval(result)
     return result
 

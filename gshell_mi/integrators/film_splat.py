@@ -8,9 +8,10 @@ of the image with expected weights,
 
 whose noise is brought back down by a control variate: det(T) h(T(u) - p) integrates to a constant,
 so a value that is independent of the samples can be subtracted from every L_i in the terms that
-involve T. The samples of each pixel are split in halves, and the mean over one half is subtracted in
-the other. (Leaving out sample i alone is biased: samples are stratified over pixels, so what is left
-would depend on the pixel of i.)
+involve T. The samples of each pixel are split in halves, and an image made of one half is subtracted
+in the other. (Leaving out sample i alone is biased: samples are stratified over pixels, so what is
+left would depend on the pixel of i.) That image is a filtered one of the pixels' means: any image
+will do, and this one needs no atomic additions per sample.
 """
 
 import drjit as dr
@@ -38,16 +39,16 @@ class FilmSplat:
         self.width, self.height = film.crop_size()
         self.rfilter = film.rfilter()
         self.box = self.rfilter.is_box_filter()
-        border = self.rfilter.border_size() if film.sample_border() else 0
+        self.border = self.rfilter.border_size() if film.sample_border() else 0
         radius = self.rfilter.radius()
         self.taps = 1 if self.box else int(dr.ceil(2 * radius - 1e-3))
         # Lowest pixel whose centre is within the filter's reach
         self.base = (mi.Point2i(dr.floor(self.u)) if self.box else
                      mi.Point2i(dr.ceil(self.u - (radius + 0.5))))
-        self.expected = [self._expected_weight(n, border) for n in (self.width, self.height)]
+        self.expected = [self._expected_weight(n) for n in (self.width, self.height)]
         self.expected[0] *= spp
 
-    def _expected_weight(self, n, border):
+    def _expected_weight(self, n):
         """Integral over the sampled interval of the filter at each of n pixels, one axis."""
         if self.box:
             return dr.ones(mi.Float, n)
@@ -55,7 +56,7 @@ class FilmSplat:
         reach = int(dr.ceil(self.rfilter.radius()))
         pixel = dr.arange(mi.Int32, n)
         total = dr.zeros(mi.Float, n)
-        low, high = dr.opaque(mi.Float, -border), dr.opaque(mi.Float, n + border)
+        low, high = dr.opaque(mi.Float, -self.border), dr.opaque(mi.Float, n + self.border)
         for k in range(-reach * steps, reach * steps):
             x = (k + 0.5) / steps
             position = mi.Float(pixel) + 0.5 + x
@@ -95,25 +96,47 @@ class FilmSplat:
                 scale = dr.select(inside, dr.rcp(ex * ey), 0)
                 yield mi.UInt32(y * self.width + x), inside, hx * hy, mi.Vector2f(sx * hy, hx * sy), scale
 
-    def _sums(self):
-        """Per half of the samples and pixel: the sum of filter weights, and of weighted values."""
-        n = self.width * self.height
-        weight = dr.zeros(mi.Float, 2 * n)
-        sums = [dr.zeros(mi.Float, 2 * n) for _ in self.values]
-        first, _ = self._halves()
-        for pixel, inside, h, _, _ in self._taps():
-            dr.scatter_add(weight, h, first + pixel, inside)
-            for s, v in zip(sums, self.values, strict=True):
-                dr.scatter_add(s, h * v, first + pixel, inside)
-        dr.eval(weight, sums)
-        return weight, sums
+    def _control(self):
+        """Per half of the samples and pixel a rough image of the values, made of the other half.
 
-    def _halves(self):
-        """Where the sums of a sample's own half and of the other one begin."""
+        Its pixels are those of the film without border; the second half follows the first.
+        """
+        spp = self.spp
+        columns, rows = self.width + 2 * self.border, self.height + 2 * self.border
         n = dr.opaque(mi.UInt32, self.width * self.height)
+        pixel = dr.arange(mi.UInt32, self.width * self.height)
+        y = pixel // dr.opaque(mi.UInt32, self.width)
+        x = pixel - y * dr.opaque(mi.UInt32, self.width)
+        half_of = self._half()
+        result = [dr.zeros(mi.Float, 2 * self.width * self.height) for _ in self.values]
+        if spp < 2:
+            return result
+        reach = 0 if self.box else max(int(dr.ceil(self.rfilter.radius() - 0.5)), 0)
+        taps = range(-reach, reach + 1)
+        kernel = [self.rfilter.eval(mi.Float(abs(k))) for k in taps]
+        for k, v in enumerate(self.values):
+            sums = dr.block_sum(v, spp)
+            in_first = dr.block_sum(dr.select(half_of == 0, v, 0), spp)
+            dr.eval(sums, in_first)
+            for half, total, count in ((0, sums - in_first, spp // 2), (1, in_first, spp - spp // 2)):
+                dr.eval(total)
+                value, weight = mi.Float(0), mi.Float(0)
+                for j, hy in zip(taps, kernel, strict=True):
+                    for i, hx in zip(taps, kernel, strict=True):
+                        cx, cy = mi.Int32(x) + (i + self.border), mi.Int32(y) + (j + self.border)
+                        inside = (cx >= 0) & (cx < columns) & (cy >= 0) & (cy < rows)
+                        h = dr.select(inside, hx * hy, 0)
+                        value += h * dr.gather(mi.Float, total, mi.UInt32(cy * columns + cx), inside)
+                        weight += h
+                dr.scatter(result[k], value / (weight * count), pixel + half * n, mode=dr.ReduceMode.Permute)
+        dr.eval(result)
+        return result
+
+    def _half(self):
+        """Which half each sample belongs to."""
         index = dr.arange(mi.UInt32, dr.width(self.u))
-        half = (index - index // dr.opaque(mi.UInt32, self.spp) * dr.opaque(mi.UInt32, self.spp)) & 1
-        return half * n, (1 - half) * n
+        spp = dr.opaque(mi.UInt32, self.spp)
+        return (index - index // spp * spp) & 1
 
     def gather(self, image):
         """Per sample and channel the filtered image value: the adjoint of splatting values."""
@@ -133,43 +156,37 @@ class FilmSplat:
         return result
 
     def adjoint(self, image_adjoint):
-        """Adjoints of the values, of the displacement T(u) - u and of det, for an image adjoint.
+        """Adjoints of the displacement T(u) - u and of det, for an image adjoint.
 
         ``image_adjoint``: list of ``Float``, one per channel, width pixels.
         """
-        weight, sums = self._sums()
-        product = dr.zeros(mi.Float, dr.width(weight))
-        pixel = dr.arange(mi.UInt32, dr.width(weight)) % dr.opaque(mi.UInt32, self.width * self.height)
-        for g, s in zip(image_adjoint, sums, strict=True):
-            product += dr.gather(mi.Float, g, pixel) * s
+        control = self._control()
+        product = mi.Float(0)
+        pixel = dr.arange(mi.UInt32, 2 * self.width * self.height)
+        pixel %= dr.opaque(mi.UInt32, self.width * self.height)
+        for g, c in zip(image_adjoint, control, strict=True):
+            product += dr.gather(mi.Float, g, pixel) * c
         dr.eval(product)
-        _, other = self._halves()
-        on_values = [mi.Float(0) for _ in self.values]
+        own_control = self._half() * dr.opaque(mi.UInt32, self.width * self.height)
         on_shift, on_det = mi.Vector2f(0), mi.Float(0)
         for pixel, inside, h, slope, scale in self._taps():
             own = mi.Float(0)
-            for c, (g, v) in enumerate(zip(image_adjoint, self.values, strict=True)):
-                gc = dr.gather(mi.Float, g, pixel, inside)
-                on_values[c] += h * scale * gc
-                own += gc * v
-            rest = dr.gather(mi.Float, weight, other + pixel, inside)
-            others = dr.gather(mi.Float, product, other + pixel, inside) / rest
-            contrast = (own - dr.select(dr.abs(rest) > 1e-2, others, 0)) * scale
+            for g, v in zip(image_adjoint, self.values, strict=True):
+                own += dr.gather(mi.Float, g, pixel, inside) * v
+            contrast = (own - dr.gather(mi.Float, product, own_control + pixel, inside)) * scale
             on_shift += slope * contrast
             on_det += h * contrast
-        return on_values, on_shift, on_det
+        return on_shift, on_det
 
     def tangent(self, value_tangents, shift, divergence):
         """The image tangent for tangents of the values, of T(u) - u and of det."""
-        weight, sums = self._sums()
-        _, other = self._halves()
+        control = self._control()
+        own_control = self._half() * dr.opaque(mi.UInt32, self.width * self.height)
         result = [dr.zeros(mi.Float, self.width * self.height) for _ in self.values]
         for pixel, inside, h, slope, scale in self._taps():
             moved = dr.dot(slope, shift) + h * divergence
-            rest = dr.gather(mi.Float, weight, other + pixel, inside)
-            for r, s, v, dv in zip(result, sums, self.values, value_tangents, strict=True):
-                others = dr.gather(mi.Float, s, other + pixel, inside) / rest
-                others = dr.select(dr.abs(rest) > 1e-2, others, 0)
+            for r, c, v, dv in zip(result, control, self.values, value_tangents, strict=True):
+                others = dr.gather(mi.Float, c, own_control + pixel, inside)
                 dr.scatter_add(r, scale * (h * dv + moved * (v - others)), pixel, inside)
         dr.eval(result)
         return result

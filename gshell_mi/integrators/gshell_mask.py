@@ -60,11 +60,15 @@ class GShellMaskIntegrator(ADIntegrator):
         """None: the AOVs of the first hit jump at silhouettes only."""
         return ()
 
+    def replays(self, scene):
+        """See ``GShellPathIntegrator.replays``."""
+        return False
+
     def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
         """See ``GShellPathIntegrator.attached``."""
         now = self.primal(scene, sampler, ray)
         if mode == dr.ADMode.Backward:
-            return on_sample(now.value, now.alpha, now.aovs)
+            return on_sample(now.value, now.alpha, now.aovs), now
         dr.forward_to(*now.aovs, *film_terms, flags=dr.ADFlag.ClearEdges)
         zero = dr.zeros(mi.Float, dr.width(now.alpha))
         tangents = on_sample(mi.Spectrum(zero), zero, [mi.Float(dr.grad(x)) for x in now.aovs])

@@ -142,21 +142,28 @@ class GShellPathIntegrator(ADIntegrator):
         """Yields the :class:`~gshell_mi.integrators.shadow_boundary.BoundaryTerm` of shadows."""
         return shadow_boundary.boundary_terms(self, scene, tables, sensor, seed)
 
+    def replays(self, scene):
+        """Whether ``attached`` needs to know the radiance and coverage of its samples beforehand."""
+        return self.max_depth > 3 or _has_bsdf_flag(scene, mi.BSDFFlags.Delta)
+
     def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
         """Derivatives of camera paths.
 
-        ``ray`` is attached to the film warp and the sensor. In reverse mode returns a ``Float`` whose
-        derivative is that of the adjoint-weighted samples; in forward mode the channels' tangents and
-        those of ``film_terms``.
+        ``ray`` is attached to the film warp and the sensor; ``state`` is what ``primal`` returned for
+        it, which is needed only if the integrator replays paths. In reverse mode returns a ``Float``
+        whose derivative is that of the adjoint-weighted samples, and the samples; in forward mode the
+        channels' tangents and those of ``film_terms``.
         """
         radiance, alpha, last, tail = self._first_vertices(scene, sampler, ray, state)
+        if state is None:
+            state = PathSample(dr.detach(radiance), dr.detach(alpha), [])
         if mode == dr.ADMode.Backward:
             total = on_sample(radiance, alpha, state.aovs)
             if tail is not None:
                 with dr.suspend_grad():
                     on_last = self._replay(mode, *tail, _adjoint_of_value(on_sample, state), mi.Vector3f(0))
                 total += dr.dot(last, on_last)
-            return total
+            return total, state
         # Interior gradients are results too, and the replay needs those of the inputs again.
         dr.forward_to(radiance, alpha, last, *film_terms, flags=dr.ADFlag.ClearEdges)
         tangent, alpha_tangent = dr.grad(radiance), mi.Float(dr.grad(alpha))
@@ -187,7 +194,12 @@ class GShellPathIntegrator(ADIntegrator):
         radiance = self._emission(scene, si, no_vertex, mi.Float(1), mi.Bool(True), mi.Bool(False), active)
         scattered = mi.Bool(False)
         throughput = mi.Spectrum(1)     # of value 1, carries the derivatives of the vertices so far
-        beta, eta, alpha = mi.Spectrum(1), mi.Float(1), state.alpha
+        beta, eta = mi.Spectrum(1), mi.Float(1)
+        if state is None:
+            always = not self.hide_emitters and scene.environment() is not None
+            alpha = dr.select(dr.detach(si.is_valid()) | always, mi.Float(1), mi.Float(0))
+        else:
+            alpha = state.alpha
 
         for vertex in range(min(self.max_depth - 1, 2)):
             active &= (depth + 1 < self.max_depth) & si.is_valid()

@@ -159,10 +159,13 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
     with dr.suspend_grad():
         sensor, sampler, spp, samples = _prepare(integrator, scene, sensor, seed, spp)
         film = sensor.film()
-        state, values = _primal(integrator, scene, sensor, sampler, samples)
-        image_adjoint = _develop_adjoint(film, grad_in, len(values), integrator.aov_names())
-        on_values, on_shift, on_det = FilmSplat(film, spp, samples.u, values).adjoint(image_adjoint)
-        dr.eval(on_values, on_shift, on_det)
+        state = None
+        if integrator.replays(scene):
+            state, _ = _primal(integrator, scene, sensor, sampler, samples)
+        count = len(film_channels(film, mi.Spectrum(0), 0, [], mi.Color0f())) + len(integrator.aov_names())
+        image_adjoint = _develop_adjoint(film, grad_in, count, integrator.aov_names())
+        on_values = FilmSplat(film, spp, samples.u).gather(image_adjoint)
+        dr.eval(on_values)
         tables = scene_edge_tables(scene)
         warp = Warp(scene, tables, sensor, samples, integrator)
         outputs = []
@@ -179,14 +182,24 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
                 channels = film_channels(film, value * weight, alpha, aovs, ray.wavelengths)
                 return sum(x * d for x, d in zip(channels, on_values, strict=True))
 
-            total = integrator.attached(dr.ADMode.Backward, scene, sampler, ray, state, on_sample)
-            outputs.append(total + dr.dot(shifted, on_shift) + det * on_det)
-            # One traversal: a second would find the edges of what the outputs share gone.
-            for output in outputs:
-                dr.set_grad(output, 1)
-                dr.enqueue(dr.ADMode.Backward, output)
-            dr.traverse(dr.ADMode.Backward)
+            total, state = integrator.attached(dr.ADMode.Backward, scene, sampler, ray, state, on_sample)
+            values = film_channels(film, dr.detach(state.value) * dr.detach(weight), dr.detach(state.alpha),
+                                   dr.detach(state.aovs), ray.wavelengths)
+            dr.schedule(values)     # together with what the traversal evaluates
+            _traverse([*outputs, total], dr.ADFlag.ClearVertices)    # the warp is passed twice
+            dr.eval(values)
+            with dr.suspend_grad():
+                on_shift, on_det = FilmSplat(film, spp, samples.u, values).adjoint(image_adjoint)
+            _traverse([dr.dot(shifted, on_shift) + det * on_det], dr.ADFlag.Default)
         dr.eval()
+
+
+def _traverse(outputs, flags):
+    """Propagates a derivative of one from each output."""
+    for output in outputs:
+        dr.set_grad(output, 1)
+        dr.enqueue(dr.ADMode.Backward, output)
+    dr.traverse(dr.ADMode.Backward, flags)
 
 
 def render_forward(integrator, scene, sensor, seed, spp):

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .edge_wedges import build_edge_wedges
+from .edge_wedges import build_edge_wedges, silhouette_for
 from .reparameterised_film import film_channels
 from .resampling import systematic_counts
 from .shadow_edges import draw_directions, draw_emitters, draw_map_directions
@@ -174,10 +174,8 @@ class _Boundary:
         middle = 0.5 * (low + high)
         outward = dr.normalize(dr.cross(axis, towards))
         outward *= -dr.sign(dr.dot(outward, inward * dr.cos(middle) + across * dr.sin(middle)))
-        view = self.viewpoint - y
-        x, z = dr.dot(view, inward), dr.dot(view, across)
-        sees_both = (z * dr.cos(high) - x * dr.sin(high) > 0) & (x * dr.sin(low) - z * dr.cos(low) > 0)
-        can_turn = sees_both & ~dr.gather(mi.Bool, self.wedges.crease, drawn.edge)
+        seen_as_silhouette = silhouette_for(self.viewpoint - y, inward, across, low, high)
+        can_turn = ~seen_as_silhouette & ~dr.gather(mi.Bool, self.wedges.crease, drawn.edge)
         cast = ~can_turn | (drawn.kind >= _TURNING)
         share = dr.select(can_turn, dr.select(cast, 1 - _TURNING, _TURNING), mi.Float(1))
         drawn.weight = drawn.weight / share

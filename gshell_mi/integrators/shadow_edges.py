@@ -52,9 +52,14 @@ class ShadowSamples:
 
 
 def draw_directions(scene, wedges, samples, shifts):
-    """Edges by length and width of their lunes, directions from the lunes."""
+    """Edges by length and width of their lunes, directions from the lunes.
+
+    Half of the samples are spread evenly over the meshes, lest the rim of a large floor gets all.
+    """
     p, q, *_ = wedges.frame(dr.arange(mi.UInt32, dr.width(wedges.start)))
-    drawn = systematic_counts(dr.norm(q - p) * wedges.opening(), samples, dr.gather(mi.Float, shifts, 7))
+    mass = dr.norm(q - p) * wedges.opening()
+    importance = mass / dr.sum(mass) + mass / (wedges.mesh_mass * wedges.meshes)
+    drawn = systematic_counts(importance, samples, dr.gather(mi.Float, shifts, 7))
     if drawn is None:
         return None
     count, weight = drawn

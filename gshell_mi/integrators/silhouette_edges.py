@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .edge_table import SIZE_INDEPENDENT
+from .shading_rims import shading_rims
 
 
 @dataclass
@@ -161,8 +162,45 @@ def _seen(scene, viewpoint, p, q):
     return seen
 
 
+def _visible_pieces(scene, sensor, mesh, start, end, lo, hi, cull):
+    """Projected pieces of a mesh's edges, attached, without hidden ones; ``None`` if there are none."""
+    if cull:
+        viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
+        flat = dr.detach(mesh.vertex_positions_buffer())
+        p, q = dr.gather(mi.Point3f, flat, start), dr.gather(mi.Point3f, flat, end)
+        seen = _seen(scene, viewpoint, dr.lerp(p, q, lo), dr.lerp(p, q, hi))
+        dr.eval(seen, start, end, lo, hi)
+        start, end, lo, hi = _compact(seen, start, end, lo, hi)
+        if dr.width(start) == 0:
+            return None
+    dr.eval(start, end, lo, hi)
+    with dr.resume_grad():
+        positions = mesh.vertex_positions_buffer()
+        p, q = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
+        return project_to_film(sensor, dr.lerp(p, q, lo)), project_to_film(sensor, dr.lerp(p, q, hi))
+
+
+def _visible_rims(scene, sensor, a, b, margin, to_camera, near, cull):
+    """The same of chords in world space, which are short enough not to be cut."""
+    viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
+    p, q = mi.Point3f(dr.detach(a)), mi.Point3f(dr.detach(b))
+    inside = ((to_camera @ p).z > near) & ((to_camera @ q).z > near)
+    u, v = project_to_film(sensor, p), project_to_film(sensor, q)
+    size = mi.Vector2f(sensor.film().crop_size())
+    inside &= dr.all((dr.maximum(u, v) > -margin) & (dr.minimum(u, v) < size + margin))
+    inside &= dr.isfinite(dr.squared_norm(u) + dr.squared_norm(v))
+    if cull:
+        inside &= _seen(scene, viewpoint, p, q)
+    index = dr.compress(inside)
+    if dr.width(index) == 0:
+        return None
+    with dr.resume_grad():
+        return tuple(project_to_film(sensor, mi.Point3f(*(dr.gather(mi.Float, x, index) for x in points)))
+                     for points in (a, b))
+
+
 def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True, crease_angle=10.0):
-    """All silhouettes of the scene's meshes, projected and cut into short pieces.
+    """All silhouettes and shading rims of the scene's meshes, projected and cut into short pieces.
 
     Parameters
     ----------
@@ -188,24 +226,13 @@ def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True, 
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
     parts = []
     for shape, table in tables:
+        rims = shading_rims(shape, viewpoint)
+        if rims is not None:
+            parts.append(_visible_rims(scene, sensor, *rims, margin, to_camera, near, cull))
         pieces = _mesh_pieces(shape, table, sensor, crease_angle, margin, piece_length, to_camera, near)
-        if pieces is None:
-            continue
-        start, end, lo, hi = pieces
-        if cull:
-            flat = dr.detach(shape.vertex_positions_buffer())
-            p, q = dr.gather(mi.Point3f, flat, start), dr.gather(mi.Point3f, flat, end)
-            seen = _seen(scene, viewpoint, dr.lerp(p, q, lo), dr.lerp(p, q, hi))
-            dr.eval(seen, start, end, lo, hi)
-            start, end, lo, hi = _compact(seen, start, end, lo, hi)
-            if dr.width(start) == 0:
-                continue
-        dr.eval(start, end, lo, hi)
-        with dr.resume_grad():
-            positions = shape.vertex_positions_buffer()
-            p, q = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
-            parts.append((project_to_film(sensor, dr.lerp(p, q, lo)),
-                          project_to_film(sensor, dr.lerp(p, q, hi))))
+        if pieces is not None:
+            parts.append(_visible_pieces(scene, sensor, shape, *pieces, cull))
+    parts = [part for part in parts if part is not None]
     if not parts:
         return None
     with dr.resume_grad():

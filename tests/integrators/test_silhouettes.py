@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gshell_mi.integrators.edge_table import build_edge_table, scene_edge_tables
+from gshell_mi.integrators.shading_rims import shading_rims
 from gshell_mi.integrators.silhouette_edges import crease_mask, screen_edges, silhouette_mask
 from pipelines import gradient_scenes as scenes
 
@@ -79,11 +80,30 @@ def projected_length(scene, **options):
 
 def test_length_of_a_projected_circle():
     v, f = scenes.sphere(4)
-    scene = scenes.load(scenes.camera(64), scenes.constant(), scenes.make_mesh("subject", v, f))
+    mesh = scenes.make_mesh("subject", v, f, smooth=False)
+    scene = scenes.load(scenes.camera(64), scenes.constant(), mesh)
     tangent = 1 / np.sqrt(5**2 - 1)     # of half the angle under which the sphere is seen
     circumference = 2 * np.pi * tangent * 32 / np.tan(np.deg2rad(20))
     # The silhouette of a polyhedron is a zigzag near that circle.
     assert projected_length(scene) == pytest.approx(circumference, rel=0.1)
+
+
+def test_shading_rim_lies_inside_the_silhouette_and_where_normals_are_at_right_angles():
+    v, f = scenes.sphere(2)
+    mesh = scenes.make_mesh("subject", v, f)
+    params = mi.traverse(mesh)
+    params["vertex_normals"] = mi.Float(params["vertex_positions"])
+    params.update()
+    viewpoint = np.array([0.3, 0.2, 6.0])
+    a, b = shading_rims(mesh, mi.Point3f(viewpoint))
+    for end in (np.array(a), np.array(b)):
+        # Where p = n, n . (o - p) = 0 is the circle p . o = 1; the chords of faces lie inside the sphere.
+        assert np.all(viewpoint @ end / np.linalg.norm(end, axis=0) ** 2 == pytest.approx(1, abs=1e-4))
+
+
+def test_flat_meshes_have_no_shading_rim():
+    v, f = scenes.sphere(2)
+    assert shading_rims(scenes.make_mesh("subject", v, f, smooth=False), mi.Point3f(0, 0, 6)) is None
 
 
 def test_hidden_silhouettes_are_culled():
