@@ -39,6 +39,7 @@ class Capture:
         frames: in the format's order.
         up: unit direction that the format says is up; None if it says nothing.
         region: (2, 3) corners of a box that the format says holds the object, or None.
+        has_opengl_axes: the format's camera axes are right, up, backward, which exporters get wrong.
     """
 
     format: str
@@ -46,6 +47,7 @@ class Capture:
     frames: tuple[Frame, ...]
     up: np.ndarray | None = None
     region: np.ndarray | None = None
+    has_opengl_axes: bool = False
 
     @property
     def training(self) -> tuple[Frame, ...]:

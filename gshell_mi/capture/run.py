@@ -93,78 +93,86 @@ class _Import:
         gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
         self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains)
         self.warnings = _profile_warning(capture, config)
+        self.cameras: dict[str, Camera] = {}
+        self.tests: dict[str, Camera] = {}
+        self.thumbnails: list[Thumbnail] = []
+        self.views: list[dict] = []
 
     def write(self, partial: Path) -> CaptureResult:
-        folder = partial / self.output.stem
-        cameras: dict[str, Camera] = {}
-        tests: dict[str, Camera] = {}
-        thumbnails, views, empty = [], [], []
+        stem = self.output.stem
+        folder = partial / stem
+        self._write_targets(folder)
+        box = self._box()
+        self.warnings += find_trouble(self.thumbnails, box, self.to_scene)
+        box = self._brought_near(box)
+        (folder / "sensors.xml").write_text(sensors_xml(self.cameras, box), encoding="utf-8")
+        if self.tests:
+            (folder / "test.xml").write_text(sensors_xml(self.tests, box), encoding="utf-8")
+        document = scene_xml(stem, box, self.config.resolution, self._copy_light(folder))
+        (partial / self.output.name).write_text(document, encoding="utf-8")
+        write_record(folder, self._record(box))
+        return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings))
+
+    def _write_targets(self, folder: Path) -> None:
+        empty = []
         for index, frame in enumerate(self.capture.frames):
             target = self.preparation.target(frame)
             if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
                 empty.append(frame.image.name)    # it would carve away everything that it frames
                 continue
-            kind, group = ("test", tests) if frame.held_out else ("view", cameras)
-            name = f"{kind}_{len(group):03}"
-            place = folder / "test" if frame.held_out else folder
-            place.mkdir(exist_ok=True)
-            write_target(place / f"{name}.exr", target.rgba)
-            group[name] = target.camera
-            if not frame.held_out:
-                thumbnails.append(Thumbnail.of(f"{name} ({frame.image.name})", target.rgba, target.camera,
-                                               target.clipped))
-            views.append(self._view_record(name, frame, target.clipped))
+            name = f"test_{len(self.tests):03}" if frame.held_out else f"view_{len(self.cameras):03}"
+            if frame.held_out:
+                (folder / "test").mkdir(exist_ok=True)
+                write_target(folder / "test" / f"{name}.exr", target.rgba)
+                self.tests[name] = target.camera
+            else:
+                write_target(folder / f"{name}.exr", target.rgba)
+                self.cameras[name] = target.camera
+                label = f"{name} ({frame.image.name})"
+                self.thumbnails.append(Thumbnail.of(label, target.rgba, target.camera, target.clipped))
+            self.views.append(self._view_record(name, frame, target.clipped))
             if self.progress:
                 self.progress(index + 1, len(self.capture.frames))
-        if not cameras:
+        if not self.cameras:
             raise UserError(f"The masks of all images of '{self.capture.source}' are empty; masks are white, "
                             f"and alpha is 1, on the object.")
         if empty:
             some = ", ".join(empty[:3]) + (" ..." if len(empty) > 3 else "")
             what = "view with an empty mask is" if len(empty) == 1 else "views with empty masks are"
             self.warnings.append(f"{len(empty)} {what} left out: {some}.")
-        box = self._box(thumbnails)
-        self.warnings += find_trouble(thumbnails, box, self.to_scene)
-        center, half = box.mean(axis=0), np.ptp(box, axis=0).max() / 2
-        if self.config.box is None and self.config.up != "keep" and np.linalg.norm(center) > _FAR * half:
-            # Geographic coordinates, say: single precision would leave little of the object.
-            shift = np.eye(4)
-            shift[:3, 3] = -center
-            self.to_scene, box = shift @ self.to_scene, box - center
-            cameras, tests = ({name: camera.moved(shift) for name, camera in group.items()}
-                              for group in (cameras, tests))
-        (folder / "sensors.xml").write_text(sensors_xml(cameras, box), encoding="utf-8")
-        if tests:
-            (folder / "test.xml").write_text(sensors_xml(tests, box), encoding="utf-8")
-        light = self._copy_light(folder)
-        (partial / self.output.name).write_text(
-            scene_xml(self.output.stem, box, self.config.resolution, light), encoding="utf-8")
-        write_record(folder, self._record(views, box))
-        return CaptureResult(self.output, len(cameras), len(tests), box, tuple(self.warnings))
 
-    def _box(self, thumbnails: list[Thumbnail]) -> np.ndarray:
+    def _box(self) -> np.ndarray:
         if self.config.box is not None:
-            low, high = np.array(self.config.box).reshape(2, 3)
-            half = (high - low).max() / 2
-            return np.stack([(low + high) / 2 - half, (low + high) / 2 + half])
-        silhouettes = [thumbnail.silhouette for thumbnail in thumbnails]
+            return _cube(np.array(self.config.box).reshape(2, 3))
+        silhouettes = [thumbnail.silhouette for thumbnail in self.thumbnails]
         region = self.capture.region
         if region is not None:
-            center = self.to_scene[:3, :3] @ region.mean(axis=0)
-            region = np.stack([center - np.ptp(region, axis=0).max() / 2,
-                               center + np.ptp(region, axis=0).max() / 2])
+            turned = self.to_scene[:3, :3] @ region.mean(axis=0)
+            region = _cube(region) - region.mean(axis=0) + turned
         box = find_box(silhouettes, region)
         if box is None:
             misreading = likely_misreading(silhouettes, self.to_scene)
-            if misreading == FLIPPED_AXES:
-                other = "leave out" if self.config.opencv_axes else "try"
-                cure = f"the cameras look misread, as the masks agree if {misreading}: {other} --opencv-axes"
-            elif misreading:
+            cure = "check the masks and cameras, or give --box and look at the picture of --check"
+            if misreading:
                 cure = f"the cameras look misread, as the masks agree if {misreading}: export them again"
-            else:
-                cure = "check the masks and cameras, or give --box and look at the picture of --check"
+                if misreading == FLIPPED_AXES and self.capture.has_opengl_axes:
+                    cure += f", or {'leave out' if self.config.opencv_axes else 'give'} --opencv-axes"
             raise UserError(f"The masks of '{self.capture.source}' have no common volume; {cure}.")
         return box
+
+    def _brought_near(self, box: np.ndarray) -> np.ndarray:
+        """Moves the world so that a box very far away comes to the origin; returns the box there."""
+        center, half = box.mean(axis=0), np.ptp(box, axis=0).max() / 2
+        told = self.config.box is not None or self.config.up == "keep"
+        if told or np.linalg.norm(center) < _FAR * half:
+            return box
+        # Geographic coordinates, say: single precision would leave little of the object.
+        shift = np.eye(4)
+        shift[:3, 3] = -center
+        self.to_scene = shift @ self.to_scene
+        self.cameras = {name: camera.moved(shift) for name, camera in self.cameras.items()}
+        self.tests = {name: camera.moved(shift) for name, camera in self.tests.items()}
+        return box - center
 
     def _copy_light(self, folder: Path) -> str | None:
         """The name of the copy, relative to the XML file."""
@@ -186,12 +194,18 @@ class _Import:
             record["exposure_stops"] = round(-float(np.log2(self.preparation.gains[frame.image])), 4)
         return record
 
-    def _record(self, views: list[dict], box: np.ndarray) -> dict:
+    def _record(self, box: np.ndarray) -> dict:
         options = {name: str(value) if isinstance(value, Path) else value
                    for name, value in dataclasses.asdict(self.config).items() if value is not None}
         return {"format": self.capture.format, "source": str(self.capture.source),
                 "capture_to_scene": self.to_scene.tolist(), "box": box.tolist(), "options": options,
-                "warnings": self.warnings, "views": views}
+                "warnings": self.warnings, "views": self.views}
+
+
+def _cube(box: np.ndarray) -> np.ndarray:
+    """The cube about the centre of a box (2, 3) that holds it."""
+    half = np.ptp(box, axis=0).max() / 2
+    return np.stack([box.mean(axis=0) - half, box.mean(axis=0) + half])
 
 
 def _profile_warning(capture: Capture, config: CaptureConfig) -> list[str]:

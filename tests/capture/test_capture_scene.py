@@ -146,7 +146,7 @@ def test_flipped_axes_are_read_as_told(source, tmp_path):
             matrix = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
             frame["transform_matrix"] = matrix.tolist()
         (tmp_path / "set" / name).write_text(json.dumps(document))
-    with pytest.raises(UserError, match=r"y and z axes point the other way .* try --opencv-axes"):
+    with pytest.raises(UserError, match=r"z axes point the other way .* export them again, or give --opencv"):
         import_capture(tmp_path / "set", tmp_path / "s.xml")
     result = import_capture(tmp_path / "set", tmp_path / "s.xml", config=CaptureConfig(opencv_axes=True))
     assert result.warnings == ()

@@ -47,7 +47,7 @@ def read(source: Path, images: Path | None = None, *, opencv_axes: bool = False)
     frames: list[Frame] = []
     for path, held_out in _files(source):
         frames += _read_file(path, held_out, opencv_axes)
-    return Capture("NeRF transforms.json", source, tuple(frames), up=_Z_UP)
+    return Capture("NeRF transforms.json", source, tuple(frames), up=_Z_UP, has_opengl_axes=True)
 
 
 def _files(source: Path) -> list[tuple[Path, bool]]:
