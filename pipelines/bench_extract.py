@@ -6,7 +6,8 @@ The surface is a shirt: a torso and two sleeves, open at neck, hem and wrists. E
 (copies of the fields), so that nothing is reused but compiled kernels; the contestants take turns, and the
 least time of each counts. Marching cubes makes the closed template only, of float32 values in the same
 order; it has no derivatives. ``backward`` is the gradient of a smooth function of vertices and mSDF with
-respect to all fields.
+respect to all fields. At the end, times and peak memory with a narrow band, and the exponents with which they
+grow: memory is what a process needs beyond that for the fields themselves.
 """
 
 import os
@@ -14,16 +15,21 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
+import json
+import re
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import drjit as dr
 import drjit.llvm.ad as llvm
 import numpy as np
 from skimage.measure import marching_cubes
 
-from gshell_mi.extraction import extract
+from gshell_mi.extraction import NarrowBand, extract
 from gshell_mi.lattice import GRIDS, Lattice, make_lattice
 
 
@@ -97,6 +103,58 @@ def run(resolution: int, grids: list[str], repeats: int) -> dict[str, float]:
     return best
 
 
+def memory(name: str) -> float:
+    """A figure of this process in MiB (Linux)."""
+    return int(re.search(rf"{name}:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) / 1024
+
+
+def run_banded(grid: str, resolution: int, repeats: int) -> dict[str, float]:
+    """Least seconds and peak memory in MiB of extractions with a band, by name."""
+    lattice = make_lattice(grid, resolution)
+    fields = [llvm.Float(a) for a in shirt(lattice)]
+    dr.eval(fields)
+    dr.sync_thread()
+    band = NarrowBand(rescan=0)
+    extract(lattice, *fields, band=band)
+    best: dict[str, float] = {}
+    dr.flush_malloc_cache()
+    before = memory("VmRSS")
+    results = {"fraction": band.fraction}
+    for what in ("forward", "forward + backward"):
+
+        def action(backward: bool = what != "forward") -> float:
+            dr.disable_grad(fields)
+            if backward:
+                dr.enable_grad(fields)
+            start = time.perf_counter()
+            mesh = extract(lattice, *fields, band=band)
+            if backward:
+                dr.backward(dr.sum(dr.squared_norm(mesh.vertices)) + dr.sum(mesh.msdf))
+                dr.eval([dr.grad(f) for f in fields])
+            dr.sync_thread()
+            return time.perf_counter() - start
+
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+        for _ in range(repeats):
+            seconds(action, best, what)
+        results[f"{what} MiB"] = memory("VmHWM") - before
+    return results | best
+
+
+def print_banded(grid: str, resolutions: list[int], repeats: int) -> None:
+    """One fresh process per resolution, as peak memory never falls."""
+    found = []
+    for resolution in resolutions:
+        command = [sys.executable, __file__, "--banded", grid, str(resolution), str(repeats)]
+        output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        found.append(json.loads(output.splitlines()[-1]))
+        row = ", ".join(f"{name} {value:.4g}" for name, value in found[-1].items())
+        print(f"  {grid} {resolution}^3 in a band: {row}")
+    for what in ("forward", "forward + backward"):
+        exponent = np.log(found[-1][what] / found[0][what]) / np.log(resolutions[-1] / resolutions[0])
+        print(f"  {grid}: seconds of {what} grow with the exponent {exponent:.2f}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -104,11 +162,20 @@ def main() -> None:
     parser.add_argument("--resolutions", type=int, nargs="+", default=[64, 128, 256], help="cells per side")
     parser.add_argument("--grids", nargs="+", default=list(GRIDS), choices=GRIDS, help="kinds of lattices")
     parser.add_argument("--repeats", type=int, default=7, help="runs of which the fastest counts")
+    parser.add_argument("--band", type=int, nargs="+", default=[128, 256, 512], help="the same with a band")
+    parser.add_argument("--banded", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     dr.set_thread_count(1)  # the calling thread is that one: there are no workers
+    if arguments.banded:
+        grid, resolution, repeats = arguments.banded
+        print(json.dumps(run_banded(grid, int(resolution), int(repeats))))
+        return
     print(f"Dr.Jit {dr.__version__}, threads: {dr.thread_count()}")
     for resolution in arguments.resolutions:
         run(resolution, arguments.grids, arguments.repeats)
+    print()
+    for grid in arguments.grids:
+        print_banded(grid, arguments.band, arguments.repeats)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from ..lattice import CubeLattice, FlexiCubesLattice, Lattice, TetLattice
 from .cubes import CubeExtraction
 from .flexicubes import FlexiCubesExtraction
 from .grid_extraction import GridExtraction
+from .narrow_band import NarrowBand
 from .surface_mesh import SurfaceMesh
 from .tetrahedra import TetExtraction
 
@@ -26,6 +27,7 @@ def extract(
     deform: Any = None,
     *,
     weights: Any = None,
+    band: NarrowBand | None = None,
     template: bool = False,
 ) -> SurfaceMesh:
     """The surface ``{sdf = 0, msdf >= 0}`` as a triangle mesh, differentiable in all three fields.
@@ -45,6 +47,7 @@ def extract(
             (x0, y0, z0, x1, ...), clipped to [-1, 1], where 1 is ``lattice.max_offset``; None for none.
         weights: for a ``FlexiCubesLattice``, 21 values per cube (``weight_count``). Any real number
             w stands for the positive weight 1 + 0.9 tanh(w); None for 0, which is neutral.
+        band: looks for the surface only where it was in the last call with this band.
         template: also return the watertight template as ``SurfaceMesh.template``.
 
     Raises:
@@ -60,31 +63,47 @@ def extract(
     >>> bowl.to_trimesh().euler_number
     1
     """
-    sdf = _checked("sdf", sdf, lattice.vertex_count)
-    if msdf is not None:
-        msdf = _checked("msdf", msdf, lattice.vertex_count)
-    if deform is not None:
-        deform = _checked("deform", deform, 3 * lattice.vertex_count)
+    sizes = {"sdf": lattice.vertex_count, "msdf": lattice.vertex_count, "deform": 3 * lattice.vertex_count}
+    fields = {"sdf": sdf, "msdf": msdf, "deform": deform}
     if weights is not None:
         if not lattice.weight_count:
             raise UserError(
                 f"weights belong to the grid 'flexicubes', not to '{lattice.grid}'; leave them out"
             )
-        weights = _checked("weights", weights, lattice.weight_count)
-    return _ALGORITHMS[type(lattice)](lattice, type(sdf)).run(sdf, msdf, deform, template, weights)
+        sizes["weights"], fields["weights"] = lattice.weight_count, weights
+    fields = {name: _flat(name, field, sizes[name]) for name, field in fields.items() if field is not None}
+    scans_all = band is None or band.is_due(lattice)
+    if scans_all:
+        _check_finite(fields)
+    algorithm = _ALGORITHMS[type(lattice)](lattice, type(fields["sdf"]), band)
+    arguments = (fields.get(name) for name in ("sdf", "msdf", "deform"))
+    mesh = algorithm.run(*arguments, template, fields.get("weights"))
+    if not scans_all and (mesh.is_empty or not _is_finite(mesh.vertices, mesh.msdf)):
+        _check_finite(fields)
+    return mesh
 
 
-def _checked(name: str, field: Any, count: int) -> Any:
-    """The field as a flat array (``Array3f`` stays), checked for its size and for NaN."""
+def _flat(name: str, field: Any, count: int) -> Any:
+    """The field as a flat array (``Array3f`` stays), checked for its size."""
     if dr.is_tensor_v(field):
         field = field.array
-    parts = list(dr.detach(field)) if dr.depth_v(field) == 2 else [dr.detach(field)]
-    size = sum(dr.width(part) for part in parts)
+    size = dr.width(field) * (3 if dr.depth_v(field) == 2 else 1)
     if size != count:
         raise UserError(f"{name} has {size} values, but the lattice needs {count}")
-    for part in parts:
-        # A sum reads the field once and is not finite if any value is not; should it have overflowed,
-        # look again value by value.
-        if not dr.isfinite(dr.sum(part))[0] and not dr.all(dr.isfinite(part))[0]:
-            raise UserError(f"{name} holds NaN or infinite values")
     return field
+
+
+def _check_finite(fields: dict[str, Any]) -> None:
+    for name, field in fields.items():
+        if not _is_finite(field):
+            raise UserError(f"{name} holds NaN or infinite values")
+
+
+def _is_finite(*fields: Any) -> bool:
+    for field in fields:
+        for part in list(dr.detach(field)) if dr.depth_v(field) == 2 else [dr.detach(field)]:
+            # A sum reads the field once and is not finite if any value is not; should it have overflowed,
+            # look again value by value.
+            if not dr.isfinite(dr.sum(part))[0] and not dr.all(dr.isfinite(part))[0]:
+                return False
+    return True

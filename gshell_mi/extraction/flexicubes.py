@@ -20,6 +20,7 @@ import drjit as dr
 from ..lattice import FlexiCubesLattice, Lattice
 from . import cube_tables as tables
 from .grid_extraction import ActiveCells, GridExtraction
+from .narrow_band import NarrowBand
 from .sign_scan import active_cells, expand
 from .surface_mesh import CutPoints, DualPoints, EdgePoints, SurfaceMesh, concatenate, gather
 from .triangle_cut import cut_triangles
@@ -51,8 +52,8 @@ class FlexiCubesExtraction(GridExtraction):
 
     EDGE_DIFFERENCES = 0b00010110
 
-    def __init__(self, lattice: FlexiCubesLattice, float_t: type):
-        super().__init__(lattice, float_t)
+    def __init__(self, lattice: FlexiCubesLattice, float_t: type, band: NarrowBand | None = None):
+        super().__init__(lattice, float_t, band)
         self.margin = dr.opaque(float_t, _MARGIN)
 
     def run(self, sdf: Any, msdf: Any, deform: Any, with_template: bool, weights: Any) -> SurfaceMesh:
@@ -96,7 +97,7 @@ class FlexiCubesExtraction(GridExtraction):
     # Polygons -----------------------------------------------------------------------------------------
 
     def active_cells(self, s: Any) -> ActiveCells:
-        cell = active_cells(s, self.lattice, closed=True)
+        cell = active_cells(s, self.lattice, closed=True, band=self.band)
         return self.classify(s, cell) if dr.width(cell) else ActiveCells(cell, cell, cell, cell)
 
     def classify(self, s: Any, cell: Any) -> ActiveCells:

@@ -20,6 +20,7 @@ import drjit as dr
 
 from ..errors import UserError
 from ..lattice import Lattice, array_type
+from .narrow_band import NarrowBand
 from .sign_scan import NEGATIVE, active_cells, corner_offset, expand
 from .surface_mesh import CutPoints, EdgePoints, Stencil, SurfaceMesh, concatenate, gather
 
@@ -49,8 +50,9 @@ class GridExtraction(ABC):
     EDGE_DIFFERENCES: ClassVar[int]
     """Bit d: the lattice has edges from the lowest corner of a cell to corner d."""
 
-    def __init__(self, lattice: Lattice, float_t: type):
+    def __init__(self, lattice: Lattice, float_t: type, band: NarrowBand | None = None):
         self.lattice = lattice
+        self.band = band
         self.float_t = float_t
         self.uint_t = uint_t = dr.uint32_array_t(float_t)
         self.vertices_t = array_type(float_t, "Array3f")
@@ -73,7 +75,7 @@ class GridExtraction(ABC):
 
     def active_cells(self, s: Any) -> ActiveCells:
         """The cells with crossed edges and few others."""
-        cell = active_cells(s, self.lattice)
+        cell = active_cells(s, self.lattice, band=self.band)
         # Operands of size 0 do not go together with others of size 1.
         return self.classify(s, cell) if dr.width(cell) else ActiveCells(cell, cell, cell, cell)
 

@@ -9,7 +9,7 @@ SCRIPT = Path(__file__).parents[2] / "pipelines" / "bench_extract.py"
 
 
 def test_prints_the_ratio_of_every_contestant():
-    command = [sys.executable, SCRIPT, "--resolutions", "8", "12", "--repeats", "1"]
+    command = [sys.executable, SCRIPT, "--resolutions", "8", "12", "--repeats", "1", "--band", "16", "32"]
     output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     heading = r"^(\d+)\^3 cells: marching cubes has (\d+) triangles$"
     found = re.findall(heading, output, re.MULTILINE)
@@ -22,3 +22,5 @@ def test_prints_the_ratio_of_every_contestant():
             for what in ("forward", "forward + backward")]
     assert sorted(name for name, *_ in rows) == sorted(2 * ["marching cubes", *ours])
     assert all(float(ratio) == 1 for name, _, ratio in rows if name == "marching cubes")
+    assert len(re.findall(r"grow with the exponent -?[\d.]+$", output, re.MULTILINE)) == 2 * len(GRIDS)
+    assert len(re.findall(r"\^3 in a band: fraction [\d.]+, forward MiB", output)) == 2 * len(GRIDS)
