@@ -66,8 +66,7 @@ def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
     fine = read_ply(folder / "mesh.ply")
     if len(fine.faces) == 0:
         raise UserError(f"'{folder / 'mesh.ply'}' is empty; there is nothing to export.")
-    scene = folder / "scene.xml"
-    turn = _to_y_up(up_axis(mi.load_file(str(scene)).sensors()) if scene.is_file() else 1)
+    turn = y_up_turn(folder)
     fine = FittedMesh(fine.vertices @ turn.T, fine.faces, fine.normals @ turn.T, fine.attributes)
     vertices, faces = _simplified(fine, config.face_count)
     atlas = unwrap(vertices, faces, texture_size=config.texture_size, seconds=config.unwrap_seconds)
@@ -158,6 +157,12 @@ def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     normals = np.array(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
     normals[np.abs((normals ** 2).sum(1) - 1) > 1e-3] = [0, 1, 0]  # of vertices without area
     return normals
+
+
+def y_up_turn(folder: Path) -> np.ndarray:
+    """The rotation (3, 3) from the scene of the fit in ``folder`` to glTF's axes, y up; ``v @ turn.T``."""
+    scene = folder / "scene.xml"
+    return _to_y_up(up_axis(mi.load_file(str(scene)).sensors()) if scene.is_file() else 1)
 
 
 def _to_y_up(axis: int) -> np.ndarray:

@@ -49,14 +49,17 @@ def write_glb(path: Path, parts: list[Part]) -> None:
     path.write_bytes(glb_bytes(parts))
 
 
-def glb_bytes(parts: list[Part]) -> bytes:
-    """The file of ``write_glb``."""
+def glb_bytes(parts: list[Part], base: bytes | None = None) -> bytes:
+    """The file of ``write_glb``; the parts follow those of the file ``base``, which ``glb_bytes`` made."""
     binary = _Binary()
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"gshell_mi {__version__}"},
-        "scene": 0, "scenes": [{"nodes": list(range(len(parts)))}],
-        "nodes": [], "meshes": [], "materials": []}
-    for number, part in enumerate(parts):
+        "scene": 0, "scenes": [{"nodes": []}], "nodes": [], "meshes": [], "materials": []}
+    if base:
+        document, data = _split(base)
+        binary.data, binary.views, binary.accessors = data, document["bufferViews"], document["accessors"]
+    for number, part in enumerate(parts, start=len(document["nodes"])):
+        document["scenes"][0]["nodes"].append(number)
         attributes = {name: binary.accessor(values.astype("<f4"), _ARRAY_BUFFER)
                       for name, values in part.attributes.items()}
         indices = binary.accessor(part.indices.reshape(-1, 1).astype("<u4"), _ELEMENT_BUFFER)
@@ -82,6 +85,27 @@ def glb_bytes(parts: list[Part]) -> bytes:
         data += pad * (-len(data) % 4)
         chunks += struct.pack("<I", len(data)) + kind + data
     return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+def read_part(data: bytes) -> Part:
+    """Triangles and attributes of the first node of a file that ``glb_bytes`` made, without its material."""
+    document, binary = _split(data)
+    primitive = document["meshes"][0]["primitives"][0]
+
+    def array(number: int) -> np.ndarray:
+        accessor = document["accessors"][number]
+        view = document["bufferViews"][accessor["bufferView"]]
+        kind = "<u4" if accessor["componentType"] == _UINT else "<f4"
+        return np.frombuffer(bytes(binary), kind, view["byteLength"] // 4,
+                             view["byteOffset"]).reshape(accessor["count"], -1)
+
+    attributes = {name: array(number) for name, number in primitive["attributes"].items()}
+    return Part(document["meshes"][0]["name"], array(primitive["indices"]).reshape(-1, 3), attributes)
+
+
+def _split(data: bytes) -> tuple[dict[str, Any], bytearray]:
+    length = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20:20 + length]), bytearray(data[28 + length:])
 
 
 class _Binary:

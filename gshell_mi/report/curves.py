@@ -1,0 +1,65 @@
+"""Curves of a fit's log as SVG."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+_WIDTH, _HEIGHT = 420, 180
+_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 10, 22, 24
+_COLORS = ("#c2571a", "#3a6ea5", "#4f8a5b", "#8a5aa5", "#777777")
+
+
+def curves(log: Path) -> list[str]:
+    """One SVG per quantity: the losses of each stage on a logarithmic axis, and PSNR. Empty without a log."""
+    if not log.is_file():
+        return []
+    stages: dict[str, dict[str, list[tuple[int, float]]]] = {}
+    for line in log.read_text().splitlines():
+        entry = json.loads(line)
+        stage = stages.setdefault(entry["stage"], {})
+        for name, value in entry.items():
+            if name not in ("stage", "iteration", "view", "seconds"):
+                stage.setdefault(name, []).append((entry["iteration"], value))
+    drawings = []
+    for stage, series in stages.items():
+        losses = {name: values for name, values in series.items() if name != "psnr"}
+        drawings.append(_plot(f"{stage}: losses", losses, logarithmic=True))
+        if "psnr" in series:
+            drawings.append(_plot(f"{stage}: PSNR of the steps' pixels (dB)", {"psnr": series["psnr"]}))
+    return drawings
+
+
+def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic: bool = False) -> str:
+    points = {}
+    for name, values in series.items():
+        x, y = (np.array(column, float) for column in zip(*values, strict=True))
+        keep = np.isfinite(y) & ((y > 0) if logarithmic else True)
+        if keep.any():
+            points[name] = (x[keep], np.log10(y[keep]) if logarithmic else y[keep])
+    if not points:
+        return ""
+    x_low, x_high = (f(np.concatenate([x for x, _ in points.values()])) for f in (np.min, np.max))
+    y_low, y_high = (f(np.concatenate([y for _, y in points.values()])) for f in (np.min, np.max))
+    x_span, y_span = max(x_high - x_low, 1), max(y_high - y_low, 1e-6)
+    across = lambda x: _LEFT + (x - x_low) / x_span * (_WIDTH - _LEFT - _RIGHT)  # noqa: E731
+    down = lambda y: _TOP + (y_high - y) / y_span * (_HEIGHT - _TOP - _BOTTOM)  # noqa: E731
+    parts = [f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{title}">',
+             f'<text x="{_LEFT}" y="14" class="title">{title}</text>']
+    for y in np.linspace(y_low, y_high, 4):
+        label = f"{10 ** y:.2g}" if logarithmic else f"{y:.3g}"
+        parts.append(f'<path class="grid" d="M{_LEFT} {down(y):.1f}H{_WIDTH - _RIGHT}"/>'
+                     f'<text x="{_LEFT - 6}" y="{down(y) + 4:.1f}" text-anchor="end">{label}</text>')
+    for x in (x_low, x_high):
+        parts.append(f'<text x="{across(x):.1f}" y="{_HEIGHT - 8}" text-anchor="middle">{x:.0f}</text>')
+    for number, (name, (x, y)) in enumerate(points.items()):
+        color = _COLORS[number % len(_COLORS)]
+        path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across(x), down(y), strict=True))
+        parts.append(f'<polyline points="{path}" stroke="{color}"><title>{name}</title></polyline>')
+        if len(points) > 1:
+            parts.append(f'<text x="{_WIDTH - _RIGHT - 46 * (len(points) - 1 - number)}" y="14" '
+                         f'text-anchor="end" fill="{color}">{name}</text>')
+    return "".join([*parts, "</svg>"])
+

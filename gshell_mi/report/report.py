@@ -1,0 +1,132 @@
+"""Gathers what a fit left behind and fills the page's template with it."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import jinja2
+import mitsuba as mi
+import numpy as np
+from markupsafe import Markup
+from PIL import Image
+
+from ..errors import UserError
+from ..export.asset import write_asset
+from ..images import srgb
+from ..turntable import TurntableConfig, render_turntable, write_video
+from .curves import curves
+from .viewer_model import viewer_model
+
+_PROBE_HEIGHT = 160
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """Settings of ``write_report``."""
+
+    turntable_frames: int = 36
+    """Pictures of the turntable."""
+    turntable_size: int = 320
+    """Its width and height in pixels; even."""
+    turntable_spp: int = 12
+    """Its samples per pixel."""
+    views: int = 8
+    """Views that are shown, spread evenly over the training views."""
+
+    def __post_init__(self):
+        if self.views < 1:
+            raise UserError(f"--views must be at least 1, not {self.views}.")
+
+
+def write_report(folder: Path, config: ReportConfig | None = None) -> Path:
+    """Writes ``report.html`` of the fit in ``folder``; makes ``mesh.glb`` first if it is missing.
+
+    Raises:
+        UserError: the folder holds no finished fit, or its mesh is empty.
+    """
+    config = config or ReportConfig()
+    folder = Path(folder)
+    metrics = _metrics(folder / "metrics.json")
+    turntable = TurntableConfig(frames=config.turntable_frames, size=config.turntable_size,
+                                spp=config.turntable_spp, fps=12, max_depth=3, orange_back=True)
+    frames = render_turntable(folder, turntable)
+    if not (folder / "mesh.glb").is_file():
+        write_asset(folder)
+    with tempfile.TemporaryDirectory() as place:
+        (video,) = write_video(frames, Path(place) / "turntable.mp4", turntable.fps, gif=False)
+        video_data = _data_url("video/mp4", video.read_bytes())
+    page = files(__package__) / "page"
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
+                                     lstrip_blocks=True)
+    template = environment.from_string((page / "report.html.j2").read_text())
+    library = (page / "model-viewer.min.js").read_text().rpartition("//# sourceMappingURL")[0]
+    text = template.render(
+        name=Path(metrics["scene"]).stem, metrics=metrics, turntable=video_data,
+        model=_data_url("model/gltf-binary", viewer_model(folder)), library=Markup(library),
+        triptychs=_triptychs(folder / "views", config.views, metrics),
+        curves=[Markup(drawing) for drawing in curves(folder / "log.jsonl")],
+        probe=_image_url(_probe(folder / "light.exr")))
+    partial = folder / ".report.html.partial"
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, folder / "report.html")
+    return folder / "report.html"
+
+
+def _metrics(path: Path) -> dict:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"'{path}' is missing or no JSON; give the folder of a finished fit.") from error
+
+
+def _triptychs(folder: Path, count: int, metrics: dict) -> list[dict]:
+    """Target, fit and error of up to ``count`` views, as data URLs."""
+    paths = sorted(folder.glob("*.png"))
+    chosen = np.unique(np.linspace(0, len(paths) - 1, count).round().astype(int)) if paths else []
+    shown = []
+    for path in (paths[i] for i in chosen):
+        pixels = np.asarray(Image.open(path).convert("RGB"))
+        width = pixels.shape[1] // 3
+        target, fit, error = (_image_url(pixels[:, i * width:(i + 1) * width]) for i in range(3))
+        shown.append({"name": path.stem, "target": target, "fit": fit, "error": error,
+                      "psnr": metrics["psnr_per_view"].get(path.stem)})
+    return shown
+
+
+def _probe(path: Path) -> np.ndarray:
+    """The light: its map, and a mirror ball and a grey ball in it, exposed alike; 8-bit."""
+    light = mi.load_dict({"type": "envmap", "filename": str(path)})
+    bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+    radiance = np.array(bitmap)
+    size = _PROBE_HEIGHT
+    sensor = {"type": "perspective", "fov": 30,
+              "to_world": mi.ScalarTransform4f().look_at([0, 0.6, 4], [0, 0, 0], [0, 1, 0]),
+              "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba"}}
+    balls = []
+    for bsdf in ({"type": "conductor", "material": "none"}, {"type": "diffuse"}):
+        scene = mi.load_dict({"type": "scene", "light": light, "ball": {"type": "sphere", "bsdf": bsdf},
+                              "sensor": sensor, "integrator": {"type": "path", "hide_emitters": True}})
+        balls.append(np.array(mi.render(scene, spp=64)))
+    exposure = 0.8 / max(float(np.percentile(radiance, 95)), 1e-6)
+    rows = np.arange(size) * len(radiance) // size
+    columns = np.arange(2 * size) * radiance.shape[1] // (2 * size)
+    pictures = [srgb(exposure * radiance[rows][:, columns])]
+    pictures += [srgb(exposure * ball[..., :3] + 1 - ball[..., 3:]) for ball in balls]
+    return (np.concatenate(pictures, axis=1) * 255 + 0.5).astype(np.uint8)
+
+
+def _image_url(pixels: np.ndarray) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "WEBP", quality=90)
+    return _data_url("image/webp", stream.getvalue())
+
+
+def _data_url(kind: str, data: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

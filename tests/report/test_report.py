@@ -1,0 +1,163 @@
+"""report.html: what is in it, and that it works in a browser without a network."""
+
+import io
+import json
+import re
+import shutil
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from fitted import open_sphere, write_fit
+from PIL import Image
+
+from gshell_mi.export.gltf import read_part
+from gshell_mi.fit.config import FitConfig
+from gshell_mi.report import ReportConfig, write_report
+from gshell_mi.report.__main__ import main
+from gshell_mi.report.curves import curves
+from gshell_mi.report.viewer_model import boundary_tubes, viewer_model
+from gshell_mi.topology import topology
+
+SMALL = ReportConfig(turntable_frames=3, turntable_size=64, turntable_spp=2, views=2)
+SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A finished fit's folder: three views whose targets are red and whose fits are blue."""
+    folder = write_fit(tmp_path_factory.mktemp("fit"), open_sphere(3))
+    (folder / "views").mkdir()
+    triptych = np.zeros((32, 96, 3), np.uint8)
+    triptych[:, :32, 0], triptych[:, 32:64, 2] = 255, 255
+    for number in range(3):
+        Image.fromarray(triptych).save(folder / "views" / f"view_{number:03}.png")
+    mesh = open_sphere(3)
+    (folder / "metrics.json").write_text(json.dumps({
+        "scene": "ball <&>.xml", "psnr_training": 31.25, "psnr_per_view": {"view_000": 31.5},
+        "counts": asdict(topology(mesh.vertices, mesh.faces)), "seconds": {"hull": 1.0, "total": 1.0},
+        "versions": {"gshell_mi": "0"}, "variant": "llvm_ad_rgb", "config": asdict(FitConfig())}))
+    lines = [{"stage": "joint", "iteration": i, "loss": 0.1 / (i + 1), "psnr": 20 + i, "seconds": 0.1}
+             for i in range(5)]
+    (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_report(folder, SMALL)
+    return folder
+
+
+def test_page_is_self_contained(folder):
+    text = (folder / "report.html").read_text()
+    page = text[:text.index('<script type="module">')]
+    sources = re.findall(r'(?:src|href)="([^"]*)"', page)
+    assert sources and all(source.startswith("data:") for source in sources)
+    assert "ball &lt;&amp;&gt;" in page, "names are escaped"
+    assert "31.25 dB" in page and "view_000: target | fit, 31.50 dB" in page and "view_002" in page
+    assert "ghost_iterations" in text and "seconds.hull" in text
+
+
+def test_curves(tmp_path):
+    log = tmp_path / "log.jsonl"
+    assert curves(log) == []
+    steps = [{"stage": "joint", "iteration": i, "loss": 10.0 ** -i, "psnr": i} for i in range(3)]
+    log.write_text("".join(json.dumps(step) + "\n" for step in steps))
+    losses, psnr = curves(log)
+    points = np.array([p.split(",") for p in re.search(r'points="([^"]*)"', losses)[1].split()], float)
+    assert np.ptp(np.diff(points, axis=0), axis=0) == pytest.approx(0, abs=0.2), "straight when logarithmic"
+    assert points[0, 1] < points[-1, 1] and "PSNR" in psnr
+    log.write_text(json.dumps({"stage": "joint", "iteration": 0, "loss": float("nan")}) + "\n")
+    assert "polyline" not in "".join(curves(log))
+
+
+def test_model_of_the_view(folder):
+    data = viewer_model(folder)
+    document = json.loads(data[20:20 + int.from_bytes(data[12:16], "little")])
+    names = ["subject", "back faces", "template", "boundary loops"]
+    assert [material["name"] for material in document["materials"]] == names
+    subject = read_part(data)
+    mesh = open_sphere(3)
+    assert topology(mesh.vertices, mesh.faces).faces == len(subject.indices)
+    primitive = document["meshes"][1]["primitives"][0]
+    assert document["accessors"][primitive["indices"]]["count"] == 3 * len(subject.indices)
+
+
+def test_tubes_follow_the_boundary():
+    mesh = open_sphere(3)
+    points, faces = boundary_tubes(mesh.vertices, mesh.faces, 0.01)
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
+    edges, uses = np.unique(edges, axis=0, return_counts=True)
+    rim = mesh.vertices[np.unique(edges[uses == 1])]
+    distance = np.linalg.norm(points[:, None] - rim[None], axis=-1).min(1)
+    assert distance == pytest.approx(np.hypot(0.01, 0.005), rel=1e-3)
+    assert len(faces) == 10 * (uses == 1).sum()
+    closed = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    assert boundary_tubes(np.eye(4)[:, :3], closed, 0.1) is None
+
+
+@pytest.fixture(scope="module")
+def page(folder):
+    """The report opened from its file in headless Chromium without a network; and its complaints."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="no playwright: the page is not opened")
+    browser_path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    with playwright.sync_playwright() as driver:
+        try:
+            browser = driver.chromium.launch(executable_path=browser_path, args=SOFTWARE_GL)
+        except playwright.Error:
+            pytest.skip("no Chromium is installed: the page is not opened")
+        page = browser.new_context(offline=True).new_page()
+        complaints = []
+        page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("requestfailed", lambda request: complaints.append(request.url[:100]))
+        page.goto((folder / "report.html").as_uri())
+        page.wait_for_function("document.getElementById('viewer').dataset.ready === 'yes'", timeout=90_000)
+        yield page, complaints
+        browser.close()
+
+
+def picture(locator) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(locator.screenshot())).convert("RGB"), float) / 255
+
+
+def test_no_console_error(page):
+    assert page[1] == []
+
+
+def test_view_draws_and_its_parts_can_be_switched(page):
+    viewer, drawn = page[0].locator("#viewer"), {}
+    for shown in ("open mesh", "template", "boundary loops", None):
+        for box in page[0].locator("input[data-materials]").all():
+            box.set_checked(shown is not None and shown in box.locator("..").inner_text())
+        page[0].wait_for_timeout(1500)
+        drawn[shown] = picture(viewer)
+    changed = {shown: (np.abs(image - drawn[None]).max(-1) > 0.02).mean()
+               for shown, image in drawn.items() if shown}
+    assert changed["open mesh"] > 0.1 and changed["template"] > 0.1
+    assert 0.0005 < changed["boundary loops"] < 0.1
+
+
+def test_slider_moves_between_target_and_fit(page):
+    pair, slider = page[0].locator(".compare").first, page[0].locator("input[type=range]").first
+    blue = []
+    for value in ("0", "50", "100"):
+        slider.fill(value)
+        image = picture(pair)
+        blue.append((image[..., 2] > 0.5).mean())
+    assert blue[0] > 0.9 and blue[1] == pytest.approx(0.5, abs=0.1) and blue[2] < 0.1
+
+
+def test_turntable_plays(page):
+    video = "document.getElementById('turntable')"
+    if not page[0].evaluate(f"""{video}.canPlayType('video/mp4; codecs="avc1.64001f"')"""):
+        pytest.skip("this Chromium was built without H.264: the turntable is not played")
+    page[0].wait_for_function(f"{video}.readyState >= 2", timeout=20_000)
+    assert page[0].evaluate(f"{video}.videoWidth") == SMALL.turntable_size
+
+
+@pytest.mark.parametrize("arguments, message", [
+    (("{none}",), "is missing or no JSON; give the folder of a finished fit"),
+    (("{fit}", "--views", "0"), "--views must be at least 1"),
+    (("{fit}", "--turntable-size", "33"), "must be even"),
+])
+def test_mistakes(folder, tmp_path, capsys, arguments, message):
+    assert main([argument.format(none=tmp_path / "none", fit=folder) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and message in error and error.count("\n") == 1
