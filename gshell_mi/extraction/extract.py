@@ -13,10 +13,10 @@ from .narrow_band import NarrowBand
 from .surface_mesh import SurfaceMesh
 from .tetrahedra import TetExtraction
 
-_ALGORITHMS: dict[type[Lattice], type[GridExtraction]] = {
-    TetLattice: TetExtraction,
-    CubeLattice: CubeExtraction,
-    FlexiCubesLattice: FlexiCubesExtraction,
+_ALGORITHMS: dict[str, type[GridExtraction]] = {
+    TetLattice.grid: TetExtraction,
+    CubeLattice.grid: CubeExtraction,
+    FlexiCubesLattice.grid: FlexiCubesExtraction,
 }
 
 
@@ -75,7 +75,7 @@ def extract(
     scans_all = band is None or band.is_due(lattice)
     if scans_all:
         _check_finite(fields)
-    algorithm = _ALGORITHMS[type(lattice)](lattice, type(fields["sdf"]), band)
+    algorithm = _ALGORITHMS[lattice.grid](lattice, type(fields["sdf"]), band)
     arguments = (fields.get(name) for name in ("sdf", "msdf", "deform"))
     mesh = algorithm.run(*arguments, template, fields.get("weights"))
     if not scans_all and (mesh.is_empty or not _is_finite(mesh.vertices, mesh.msdf)):
