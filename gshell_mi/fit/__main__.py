@@ -29,6 +29,8 @@ class _Arguments:
     """Continue an interrupted fit in the output folder."""
     overwrite: bool = False
     """Replace an earlier fit in the output folder."""
+    no_report: bool = False
+    """Leave out mesh.glb and report.html, which take some seconds."""
     quiet: bool = False
     """No progress bars."""
     config: Annotated[FitConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FitConfig)
@@ -45,7 +47,8 @@ def main(arguments: list[str] | None = None) -> int:
         from .run import fit_scene
 
         result = fit_scene(given.scene, given.output, targets=given.targets, config=given.config,
-                           resume=given.resume, overwrite=given.overwrite, quiet=given.quiet)
+                           resume=given.resume, overwrite=given.overwrite, report=not given.no_report,
+                           quiet=given.quiet)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

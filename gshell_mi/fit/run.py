@@ -16,11 +16,13 @@ import numpy as np
 
 from ..errors import UserError
 from ..export import check_output_folder, export_fit, make_output_folder, write_metrics
+from ..export.asset import write_asset
 from ..fields import LatticeFields
 from ..fields.visual_hull import visual_hull
 from ..lattice import make_lattice
 from ..light import EnvironmentLight
 from ..material import MaterialField, given_material
+from ..report import write_report
 from ..scene import load_fit_scene
 from ..views import PinholeViews
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
@@ -53,7 +55,7 @@ class FitResult:
 
 def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: str | Path | None = None,
               config: FitConfig | None = None, resume: bool = False, overwrite: bool = False,
-              quiet: bool = True) -> FitResult:
+              report: bool = True, quiet: bool = True) -> FitResult:
     """Reconstructs the gshell shape of a fit scene, its material and its light.
 
     A Mitsuba ``llvm`` or ``cuda`` variant must be set.
@@ -65,6 +67,7 @@ def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: s
         config: settings.
         resume: continue from the checkpoint in ``output``.
         overwrite: replace an earlier fit in ``output``.
+        report: also write ``mesh.glb`` and ``report.html``.
         quiet: no progress bar.
 
     Raises:
@@ -74,13 +77,13 @@ def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: s
     scene = Path(scene)
     output = Path(output) if output else default_output(scene)
     with Interrupt() as interrupt, Progress(quiet=quiet) as progress:
-        return _Fit(scene, output, targets, config, resume, overwrite, progress, interrupt).run()
+        return _Fit(scene, output, targets, config, resume, overwrite, report, progress, interrupt).run()
 
 
 class _Fit:
     def __init__(self, scene: Path, output: Path, targets: str | Path | None, config: FitConfig, resume: bool,
-                 overwrite: bool, progress: Progress, interrupt: Interrupt):
-        self.config, self.output = config, output
+                 overwrite: bool, report: bool, progress: Progress, interrupt: Interrupt):
+        self.config, self.output, self.report = config, output, report
         self.progress, self.interrupt = progress, interrupt
         self.path = output / "checkpoint.npz"
         self.checkpoint = Checkpoint("hull", 0, _plain(config))
@@ -111,6 +114,9 @@ class _Fit:
             with self.progress.stage("export", None), self._timed("export"):
                 metrics = export_fit(self.output, self.scene, joint, self.config)
             metrics = write_metrics(self.output, metrics, self.checkpoint.seconds)
+            if self.report:
+                self._write_documents()
+                metrics = write_metrics(self.output, metrics, self.checkpoint.seconds)
         except OSError as error:
             raise UserError(f"'{error.filename or self.output}' cannot be written "
                             f"({error.strerror or error}); free some space or mend its permissions, then "
@@ -206,6 +212,16 @@ class _Fit:
             self.checkpoint.stage = "done"
             self.checkpoint.save(self.path)
         return joint
+
+    def _write_documents(self) -> None:
+        """The asset and the report; for want of them a fit is not lost."""
+        try:
+            with self.progress.stage("mesh.glb", None), self._timed("asset"):
+                write_asset(self.output)
+            with self.progress.stage("report", None), self._timed("report"):
+                write_report(self.output)
+        except UserError as error:
+            self.progress.warn(str(error))
 
     # --- bookkeeping
 

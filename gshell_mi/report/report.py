@@ -31,11 +31,11 @@ _PROBE_HEIGHT = 160
 class ReportConfig:
     """Settings of ``write_report``."""
 
-    turntable_frames: int = 36
+    turntable_frames: int = 30
     """Pictures of the turntable."""
     turntable_size: int = 320
     """Its width and height in pixels; even."""
-    turntable_spp: int = 12
+    turntable_spp: int = 8
     """Its samples per pixel."""
     views: int = 8
     """Views that are shown, spread evenly over the training views."""

@@ -204,3 +204,14 @@ def test_killed_and_resumed(bowl_scene, whole, tmp_path, record_property):
     record_property("distance of a whole and a killed run", to_killed)
     # Sums over threads depend on their order, and rounding grows from step to step.
     assert to_killed <= 2 * between_whole_runs + 2e-4
+
+
+def test_asset_and_report_come_with_a_fit(bowl_scene, tmp_path):
+    options = [option for option in SHORT if option != "--no-report"]
+    output = tmp_path / "out"
+    assert main([str(bowl_scene), "-o", str(output), "--quiet", *options, *CLOSED, "--iterations", "1"]) == 0
+    seconds = json.loads((output / "metrics.json").read_text())["seconds"]
+    assert seconds["asset"] > 0 and seconds["report"] > 0
+    assert seconds["total"] == pytest.approx(sum(seconds.values()) - seconds["total"], abs=0.01)
+    assert (output / "mesh.glb").read_bytes()[:4] == b"glTF"
+    assert "model-viewer" in (output / "report.html").read_text()

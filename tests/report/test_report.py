@@ -96,7 +96,8 @@ def test_tubes_follow_the_boundary():
 def page(folder):
     """The report opened from its file in headless Chromium without a network; and its complaints."""
     playwright = pytest.importorskip("playwright.sync_api", reason="no playwright: the page is not opened")
-    browser_path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    names = ("chromium", "chromium-browser", "google-chrome")
+    browser_path = next(filter(None, map(shutil.which, names)), None)
     with playwright.sync_playwright() as driver:
         try:
             browser = driver.chromium.launch(executable_path=browser_path, args=SOFTWARE_GL)
