@@ -21,12 +21,23 @@ True
 """
 
 from .errors import UserError
-from .extraction import SurfaceMesh, extract
+from .extraction import NarrowBand, SurfaceMesh, extract
 from .fields import LatticeFields
-from .lattice import TetLattice
+from .lattice import CubeLattice, FlexiCubesLattice, TetLattice, make_lattice
 from .plugins import register_on_variant_change
 
 __version__ = "0.1.0"
-__all__ = ["LatticeFields", "SurfaceMesh", "TetLattice", "UserError", "__version__", "extract"]
+__all__ = [
+    "CubeLattice",
+    "FlexiCubesLattice",
+    "LatticeFields",
+    "NarrowBand",
+    "SurfaceMesh",
+    "TetLattice",
+    "UserError",
+    "__version__",
+    "extract",
+    "make_lattice",
+]
 
 register_on_variant_change()

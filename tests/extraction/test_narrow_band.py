@@ -26,7 +26,7 @@ def _ball(lattice, radius=0.3, x=0.0, y=0.0):
 def test_same_as_without_while_the_surface_moves_through_the_lattice(lattice):
     """Bit by bit, up to where the ball touches the border of the lattice; it is cut and grows."""
     band, z = NarrowBand(rescan=0), lattice.points(mi.Float).z
-    for x in np.linspace(-0.6, 0.75, 9):
+    for x in np.arange(-0.6, 0.75, 0.09):  # of less than 3.3 cells
         sdf, msdf = _ball(lattice, 0.25 + 0.1 * x, x), 0.1 - z
         mesh = extract(lattice, sdf, msdf, template=True, band=band)
         dense = extract(lattice, sdf, msdf, template=True)
