@@ -1,0 +1,89 @@
+"""Writes docs/commands.md from the dataclasses that are the commands' arguments.
+
+    python pipelines/command_reference.py           # writes it
+    python pipelines/command_reference.py --check   # exit code 1 if it is out of date
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib
+import inspect
+import itertools
+import sys
+import textwrap
+import typing
+from pathlib import Path
+
+COMMANDS = ("capture", "fit", "export", "turntable", "compare", "report")
+PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
+
+_INTRODUCTION = """\
+# Commands
+
+Made from the code by `python pipelines/command_reference.py`; each command's `--help` says the same. All
+leave with exit code 0 on success and 2 on a mistake in what they were given: one sentence on stderr tells which,
+and how to mend it. `python -m gshell_mi.doctor` tells whether this machine can run them.
+"""
+
+
+def reference() -> str:
+    """The whole page."""
+    sections = [_INTRODUCTION]
+    for command in COMMANDS:
+        module = importlib.import_module(f"gshell_mi.{command}.__main__")
+        title = module.__doc__.splitlines()[0].split(": ", 1)[1]
+        rows = ["| argument | default | |", "|---|---|---|", *_rows(module._Arguments)]
+        sections.append(f"## `python -m gshell_mi.{command}`\n\n{title[0].upper()}{title[1:]}\n\n"
+                        + "\n".join(rows) + "\n")
+    return "\n".join(sections)
+
+
+def _rows(arguments: type) -> list[str]:
+    rows = []
+    types = typing.get_type_hints(arguments, include_extras=True)
+    texts = _field_texts(arguments)
+    for field in dataclasses.fields(arguments):
+        kind = types[field.name]
+        inner = typing.get_args(kind)[0] if typing.get_origin(kind) is typing.Annotated else kind
+        if dataclasses.is_dataclass(inner):
+            rows += _rows(inner)
+            continue
+        name = "--" + field.name.replace("_", "-")
+        metadata = str(getattr(kind, "__metadata__", ""))
+        if "-o" in metadata:
+            name = f"-o, {name}"
+        if "positional" in metadata.lower():
+            name = field.name.upper()
+        rows.append(f"| `{name}` | {_default(field)} | {texts[field.name]} |")
+    return rows
+
+
+def _default(field: dataclasses.Field) -> str:
+    if field.default in (dataclasses.MISSING, None):
+        return ""
+    if field.default is False:
+        return "off"
+    return f"`{'on' if field.default is True else field.default}`"
+
+
+def _field_texts(arguments: type) -> dict[str, str]:
+    """The docstring under each field."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(arguments))).body[0].body
+    texts = {}
+    for statement, following in itertools.pairwise(body):
+        if isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr):
+            texts[statement.target.id] = " ".join(following.value.value.split()).replace("|", "\\|")
+    return texts
+
+
+def main() -> int:
+    if "--check" in sys.argv[1:]:
+        return int(PAGE.read_text() != reference())
+    PAGE.write_text(reference())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
