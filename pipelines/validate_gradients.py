@@ -93,16 +93,20 @@ def measure(case, resolution, seconds, stock=True):
     def forward(seed, spp=SPP):
         return gradient_scenes.forward_image(mover, ours, spp, seed)
 
-    reference = repeat(finite_difference, 0.003, seconds)
-    mover.to(mi.Float(0))
+    kept = recall(case, resolution)
+    if stock or not kept:
+        fd = mean_and_error(repeat(finite_difference, 0.003, seconds))
+        image = averages["fd"][0]
+    else:
+        fd, image = kept["fd"], kept["images"][0]
     derivative = repeat(lambda seed: remembered("ours", forward(seed)), 0.003, seconds)
     few = repeat(lambda seed: total(forward(10_000 + seed, 4)), 0.008, seconds / 3)
     first = total(forward(0))
     reverse = gradient_scenes.reverse_derivative(mover, ours, SPP, 0, weights)
-    row = {"seconds": seconds, "fd": mean_and_error(reference), "ours": mean_and_error(derivative),
+    row = {"seconds": seconds, "fd": fd, "ours": mean_and_error(derivative),
            "few": mean_and_error(few), "mismatch": abs(reverse - first) / max(abs(reverse), 1e-9),
-           "correlation": correlation(averages["fd"][0], averages["ours"][0]),
-           "stock": recall(case, resolution).get("stock", {})}
+           "correlation": correlation(image, averages["ours"][0]),
+           "stock": kept.get("stock", {})}
     for name in ("prb_projective", "direct_projective"):
         if not stock or (name == "direct_projective" and case.depth != 2):
             continue
@@ -111,11 +115,11 @@ def measure(case, resolution, seconds, stock=True):
             integrator = mi.load_dict({"type": name, "hide_emitters": case.hide_emitters, **extra})
             values = repeat(lambda seed: remembered(name, gradient_scenes.forward_image(     # noqa: B023
                 mover, integrator, 16, seed)), 0.01, 0, least=3)     # noqa: B023
-            row["stock"][name] = (*mean_and_error(values), correlation(averages["fd"][0], averages[name][0]))
+            row["stock"][name] = (*mean_and_error(values), correlation(image, averages[name][0]))
         except Exception as error:    # a stock integrator that cannot do a scene is a result
             row["stock"][name] = f"fails ({type(error).__name__})"
     RESULTS.mkdir(parents=True, exist_ok=True)
-    np.savez(stored_at(case, resolution), row=json.dumps(row), fd=averages["fd"][0], ours=averages["ours"][0])
+    np.savez(stored_at(case, resolution), row=json.dumps(row), fd=image, ours=averages["ours"][0])
 
 
 def stored_at(case, resolution):
@@ -198,7 +202,8 @@ def main():
     parser.add_argument("--resolution", type=int, default=64, help="pixels per side (default 64)")
     parser.add_argument("--seconds", type=float, default=25,
                         help="greatest processor time for one figure (default 25)")
-    parser.add_argument("--ours", action="store_true", help="measure gshell_path anew, but no stock one")
+    parser.add_argument("--ours", action="store_true",
+                        help="measure gshell_path anew, and keep what was measured of the others")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default llvm_ad_rgb)")
     arguments = parser.parse_args()
     mi.set_variant(arguments.variant)

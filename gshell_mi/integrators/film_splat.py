@@ -132,6 +132,15 @@ class FilmSplat:
         dr.eval(result)
         return result
 
+    def mean_control(self):
+        """Per pixel and channel what is subtracted from the samples on average."""
+        n = self.width * self.height
+        pixel = dr.arange(mi.UInt32, n)
+        share = (self.spp - self.spp // 2) / self.spp
+        second = pixel + dr.opaque(mi.UInt32, n)
+        return [share * dr.gather(mi.Float, c, pixel) + (1 - share) * dr.gather(mi.Float, c, second)
+                for c in self._control()]
+
     def _half(self):
         """Which half each sample belongs to."""
         index = dr.arange(mi.UInt32, dr.width(self.u))

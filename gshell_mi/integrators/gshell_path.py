@@ -24,8 +24,9 @@ class GShellPathIntegrator(ADIntegrator):
 
     * ``max_depth`` (int, default 6), ``rr_depth`` (int, default 5), ``hide_emitters`` (bool, default
       false): as for ``prb``.
-    * ``reparam_depth`` (int, default 2): how many segments of a path may lose sight of what they see:
-      1 the camera's, 2 also what the first surface receives, 3 also what the second one does.
+    * ``reparam_depth`` (int, default 1): how many segments of a path may lose sight of what they see:
+      1 the camera's, 2 also what the first surface receives, 3 also what the second one does. Shadows
+      need 2; fits of whole objects do as well without, in less time (``docs/gradients.md``).
     * ``warp_radius`` (float, default 2 pixels): how far the warp reaches around a silhouette.
     * ``light_edge_samples`` (float, default 1): samples of shadow boundaries per pixel of the film.
     * ``crease_angle`` (float, default 10 degrees): edges of flat-shaded meshes above it count as
@@ -46,7 +47,7 @@ class GShellPathIntegrator(ADIntegrator):
         self.hide_emitters = props.get("hide_emitters", False)
         self.warp_radius = props.get("warp_radius", 2.0)
         self.cull_hidden = props.get("cull_hidden", True)
-        self.reparam_depth = props.get("reparam_depth", 2)
+        self.reparam_depth = props.get("reparam_depth", 1)
         if self.reparam_depth not in (1, 2, 3):
             raise UserError(f"gshell_path: reparam_depth is {self.reparam_depth}, but has to be 1, 2 or 3.")
         self.said = set()   # warnings given so far
@@ -195,8 +196,8 @@ class GShellPathIntegrator(ADIntegrator):
         scattered = mi.Bool(False)
         throughput = mi.Spectrum(1)     # of value 1, carries the derivatives of the vertices so far
         beta, eta = mi.Spectrum(1), mi.Float(1)
+        always = not self.hide_emitters and scene.environment() is not None
         if state is None:
-            always = not self.hide_emitters and scene.environment() is not None
             alpha = dr.select(dr.detach(si.is_valid()) | always, mi.Float(1), mi.Float(0))
         else:
             alpha = state.alpha
@@ -234,8 +235,9 @@ class GShellPathIntegrator(ADIntegrator):
             along.o = dr.replace_grad(ray_next.o, si.p)
             change = dr.relative_grad(bsdf.eval(context, si, si.to_local(ray_next.d), active))
             if special:
-                d, change, alpha = self._delta_lobe(bsdf, si, ray, ray_next, choice, sample2, delta, active,
-                                                    sample.sampled_type, change, alpha)
+                d, change, seen = self._delta_lobe(bsdf, si, ray, ray_next, choice, sample2, delta, active,
+                                                   sample.sampled_type, change)
+                alpha *= 1 if always else seen
                 along.d = dr.replace_grad(ray_next.d, d)
             throughput = throughput * change
             si_next = pi.compute_surface_interaction(along, mi.RayFlags.All, active)
@@ -266,8 +268,8 @@ class GShellPathIntegrator(ADIntegrator):
         passes = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
         return dr.select(passes, dr.relative_grad(bsdf.eval_null_transmission(si, active)), change)
 
-    def _delta_lobe(self, bsdf, si, ray, ray_next, choice, sample2, delta, active, kind, change, alpha):
-        """Direction, relative weight and coverage where the first surface scatters in one direction.
+    def _delta_lobe(self, bsdf, si, ray, ray_next, choice, sample2, delta, active, kind, change):
+        """Direction, and relative weight and coverage, where the first surface scatters in one direction.
 
         A mirrored or refracted direction follows the surface, and one that passes through (``mask``)
         the camera ray; the chance to pass is the opacity's complement.
@@ -281,7 +283,7 @@ class GShellPathIntegrator(ADIntegrator):
                            dr.select(delta, dr.relative_grad(weight), change))
         opacity = 1 - dr.mean(mi.unpolarized_spectrum(transmission))
         seen = dr.select(passes, dr.relative_grad(1 - opacity), dr.relative_grad(opacity))
-        return d, change, alpha * dr.select(active, seen, 1)
+        return d, change, dr.select(active, seen, 1)
 
     @dr.syntax
     def _replay(self, mode, scene, sampler, ray, pi, si_prev, L, beta, eta, pdf_prev, delta_prev, active,

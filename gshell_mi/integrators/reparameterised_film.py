@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from .edge_table import scene_edge_tables
 from .film_splat import FilmSplat
+from .pixel_borders import PixelBorders
 from .silhouette_edges import screen_edges
 from .supported_scenes import check_sensor, warn_once
 from .warp import EdgeGrid, FilmWarp, fixed_line_weight
@@ -122,17 +123,40 @@ class Warp:
                                              grad_fixed)
             return u + velocity, 1 + divergence
 
+    def is_near(self, u):
+        """Whether any edge is close to the pixel that holds ``u``."""
+        if self.grid is None:
+            return dr.zeros(mi.Bool, dr.width(u))
+        first, last = self.grid.list_at(u)
+        return first < last
+
     def _fixed_lines(self, u):
-        """T must keep what the filter or the frame cuts off: their lines do not move."""
-        if self.film.rfilter().is_box_filter():
-            cell = dr.floor(u)
-            lines = [(k, cell[k] + side) for k in (0, 1) for side in (0, 1)]
-            return fixed_line_weight(u, lines, 0.5)
-        if not self.film.sample_border():
-            size = mi.Point2f(self.film.crop_size())
-            return fixed_line_weight(u, [(k, x) for k in (0, 1) for x in (mi.Float(0), size[k])],
-                                     self.radius)
-        return mi.Float(0), mi.Vector2f(0)
+        """T must keep what the frame cuts off: its lines do not move."""
+        if self.film.sample_border() or self.film.rfilter().is_box_filter():
+            return mi.Float(0), mi.Vector2f(0)
+        size = mi.Point2f(self.film.crop_size())
+        return fixed_line_weight(u, [(k, x) for k in (0, 1) for x in (mi.Float(0), size[k])], self.radius)
+
+
+def _borders(integrator, scene, sensor, warp, seed, spp):
+    """For the box filter, samples on pixel borders and their channels; else ``None``."""
+    film = sensor.film()
+    if not film.rfilter().is_box_filter():
+        return None
+
+    def sampler(size):
+        result = mi.load_dict({"type": "independent"})
+        result.seed(mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(1))[0], size)
+        return result
+
+    borders = PixelBorders(film, warp, max(spp // 4, 1), sampler)
+    if borders.size == 0:
+        return None
+    draw = borders.sampler
+    time = sensor.shutter_open() + draw.next_1d() * sensor.shutter_open_time()
+    wavelength = draw.next_1d() if mi.is_spectral else mi.Float(0)
+    samples = CameraSamples(borders.u, time, wavelength, (0, 0), (0, 0))
+    return borders, _primal(integrator, scene, sensor, draw, samples)[1]
 
 
 def _prepare(integrator, scene, sensor, seed, spp):
@@ -189,8 +213,15 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
             _traverse([*outputs, total], dr.ADFlag.ClearVertices)    # the warp is passed twice
             dr.eval(values)
             with dr.suspend_grad():
-                on_shift, on_det = FilmSplat(film, spp, samples.u, values).adjoint(image_adjoint)
-            _traverse([dr.dot(shifted, on_shift) + det * on_det], dr.ADFlag.Default)
+                splat = FilmSplat(film, spp, samples.u, values)
+                on_shift, on_det = splat.adjoint(image_adjoint)
+                borders = _borders(integrator, scene, sensor, warp, seed, spp)
+            outputs = [dr.dot(shifted, on_shift) + det * on_det]
+            if borders is not None:
+                borders, on_border = borders
+                on_flux = borders.adjoint(image_adjoint, on_border, splat.mean_control())
+                outputs.append(borders.flux(warp) * on_flux)
+            _traverse(outputs, dr.ADFlag.Default)
         dr.eval()
 
 
@@ -211,8 +242,11 @@ def render_forward(integrator, scene, sensor, seed, spp):
         tables = scene_edge_tables(scene)
         warp = Warp(scene, tables, sensor, samples, integrator)
         boundary = list(integrator.boundary_terms(scene, tables, sensor, seed))
+        borders = _borders(integrator, scene, sensor, warp, seed, spp)
         with dr.resume_grad():
             swept = [term.swept(warp) for term in boundary]
+            if borders is not None:
+                swept.append(borders[0].flux(warp))
             shifted, det = warp(samples.u)
             ray, weight = samples.rays(sensor, shifted)
 
@@ -222,7 +256,10 @@ def render_forward(integrator, scene, sensor, seed, spp):
             tangents, (shift, divergence, *swept) = integrator.attached(
                 dr.ADMode.Forward, scene, sampler, ray, state, on_sample, (shifted, det, *swept))
         dr.eval(tangents, shift, divergence, swept)
-        image = FilmSplat(film, spp, samples.u, values).tangent(tangents, shift, divergence)
+        splat = FilmSplat(film, spp, samples.u, values)
+        image = splat.tangent(tangents, shift, divergence)
+        if borders is not None:
+            borders[0].scatter(image, swept.pop(), borders[1], splat.mean_control())
         for term, area in zip(boundary, swept, strict=True):
             jumps = FilmSplat(film, 1, term.film).scatter([x * area for x in term.jump])
             image = [a + b for a, b in zip(image, jumps, strict=True)]

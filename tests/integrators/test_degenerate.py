@@ -23,6 +23,11 @@ def gradient(scene, integrator, spp=4, seed=0):
     return np.array(image), np.array(dr.grad(params[key]))
 
 
+def make_integrator(kind="gshell_path"):
+    options = {"max_depth": 3, "reparam_depth": 3, "hide_emitters": True} if kind == "gshell_path" else {}
+    return mi.load_dict({"type": kind, **options})
+
+
 MESHES = {
     "degenerate faces": (scenes.sphere(1)[0], np.concatenate([scenes.sphere(1)[1], [[0, 0, 0], [3, 3, 5]]])),
     "zero-area face": ([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]], [[0, 1, 2], [0, 1, 3]]),
@@ -34,12 +39,25 @@ MESHES = {
 
 
 @pytest.mark.parametrize("kind", ["gshell_path", "gshell_mask"])
+def test_empty_mesh_beside_another_changes_nothing(kind):
+    """Mitsuba cannot render a mesh of no faces at all; an empty one has a face without extent."""
+    v, f = scenes.sphere(1, 0.7)
+    empty = scenes.make_mesh("empty", np.zeros((3, 3)), np.zeros((1, 3), int))
+    integrator = make_integrator(kind)
+    with_it, without = (gradient(scenes.load(scenes.camera(16), scenes.constant(),
+                                             scenes.make_mesh("subject", v, f), **others), integrator)
+                        for others in ({"other": empty}, {}))
+    np.testing.assert_allclose(with_it[0], without[0], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(with_it[1], without[1], atol=1e-3 * np.abs(without[1]).max())
+
+
+@pytest.mark.parametrize("kind", ["gshell_path", "gshell_mask"])
 @pytest.mark.parametrize("name", MESHES)
 def test_finite(name, kind):
     v, f = MESHES[name]
     v = np.array(v, float) + (np.array([0, 0.01, 5]) if name == "through the camera" else 0)
     scene = scenes.load(scenes.camera(16), scenes.constant(), scenes.make_mesh("subject", v, f))
-    image, grad = gradient(scene, mi.load_dict({"type": kind, "max_depth": 3}))
+    image, grad = gradient(scene, make_integrator(kind))
     assert np.isfinite(image).all() and np.isfinite(grad).all()
 
 
@@ -63,7 +81,7 @@ def compiled(run):
 
 def test_no_recompilation_when_sizes_change():
     """A mesh of another connectivity in every iteration, its buffers padded to the same sizes."""
-    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 3, "hide_emitters": True})
+    integrator = make_integrator()
     scene = scenes.load(scenes.camera(24), scenes.constant(),
                         scenes.make_mesh("subject", np.zeros((600, 3)), np.zeros((1200, 3), int)))
     params = mi.traverse(scene)
@@ -90,7 +108,7 @@ def test_no_recompilation_when_sizes_change():
 
 @pytest.mark.slow
 def test_memory_stays_flat():
-    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 3, "hide_emitters": True})
+    integrator = make_integrator()
     v, f = scenes.sphere(2)
     scene = scenes.load(scenes.camera(16), scenes.constant(), scenes.make_mesh("subject", v, f))
     for seed in range(50):

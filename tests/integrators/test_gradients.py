@@ -1,5 +1,7 @@
 """Derivatives of gshell_path and gshell_mask against finite differences and against each other."""
 
+import warnings
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -121,6 +123,47 @@ def test_material_and_light_receive_derivatives():
     by_light = dr.sum(params[light] * dr.grad(params[light]))
     assert by_albedo[0] == pytest.approx(total.array[0], rel=0.01)
     assert by_light[0] == pytest.approx(total.array[0], rel=0.01)
+
+
+def opacity_derivative(hide_emitters, depth, **others):
+    """Sum over the pixels of the derivative by a sheet's opacity, and the scene and its parameters."""
+    sheet = {"type": "mask", "opacity": {"type": "uniform", "value": 0.5}, "bsdf": scenes.diffuse()}
+    v, f = scenes.sheet()
+    subject = scenes.make_mesh("subject", v, f, sheet)
+    scene = scenes.load(scenes.camera(RESOLUTION), scenes.constant(), subject, **others)
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("opacity.value"))
+    dr.enable_grad(params[key])
+    params.update()
+    dr.set_grad(params[key], 1)
+    integrator = mi.load_dict({"type": "gshell_path", "max_depth": depth, "hide_emitters": hide_emitters})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)     # that shadows through it have no derivative
+        image = mi.render(scene, params, integrator=integrator, spp=256)
+    return np.array(dr.forward_to(image)).sum((0, 1)), scene, params, key
+
+
+def test_opacity_of_a_lone_sheet():
+    """The sheet shows its albedo times its opacity, and its coverage is its opacity."""
+    derivative, scene, *_ = opacity_derivative(True, 2)
+    mask = mi.load_dict({"type": "gshell_mask"})
+    area = np.array(mi.render(scene, integrator=mask, spp=256))[..., 3].sum()
+    np.testing.assert_allclose(derivative, area * np.array([0.8, 0.5, 0.3, 1]), rtol=0.03)
+
+
+def test_opacity_before_another_surface():
+    """The image is a polynomial of the opacity, of degree 2 but for what is too dim to matter."""
+    ball = scenes.make_mesh("ball", *scenes.sphere(2, 0.5, (0, 0, -1)))
+    derivative, scene, params, key = opacity_derivative(False, 4, ball=ball)
+    stock = mi.load_dict({"type": "path", "max_depth": 4})
+    images = []
+    for opacity in (0.35, 0.65):
+        params[key] = opacity
+        params.update()
+        images.append(np.array(mi.render(scene, integrator=stock, spp=2048)))
+    expected = ((images[1] - images[0]) / 0.3).sum((0, 1))
+    np.testing.assert_allclose(derivative, expected, atol=0.03 * np.abs(expected).max())
+    assert derivative[3] == 0
 
 
 def test_camera_motion_is_the_opposite_of_object_motion():
