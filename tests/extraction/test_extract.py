@@ -107,6 +107,18 @@ def test_guarantee_on_random_lattices(grid, seed, resolution, levels, deformed):
     _assert_guarantee(mesh, lattice, sdf, msdf)
 
 
+@pytest.mark.slow
+def test_guarantee_on_a_thousand_random_lattices(grid):
+    for seed in range(1000):
+        rng = np.random.default_rng(seed)
+        lattice = make_lattice(grid, int(rng.integers(1, 6)))
+        levels = rng.choice([1, 2, 50, 1000])
+        sdf, msdf = np.round(rng.uniform(-1.5, 1.5, (2, lattice.vertex_count)) * levels) / levels
+        deform = rng.choice([-1.0, 0.0, 1.0], 3 * lattice.vertex_count)
+        weights = rng.choice([-9.0, 0.0, 9.0], lattice.weight_count) if lattice.weight_count else None
+        _assert_guarantee(_mesh(lattice, sdf, msdf, deform, weights, template=True), lattice, sdf, msdf)
+
+
 def test_no_degenerate_faces_at_high_resolution(grid):
     lattice = make_lattice(grid, 32)
     sdf, msdf = np.random.default_rng(0).integers(-1, 2, (2, lattice.vertex_count))
