@@ -23,8 +23,8 @@ _INTRODUCTION = """\
 # Commands
 
 Made from the code by `python pipelines/command_reference.py`; each command's `--help` says the same. All
-leave with exit code 0 on success and 2 on a mistake in what they were given: one sentence on stderr tells which,
-and how to mend it. `python -m gshell_mi.doctor` tells whether this machine can run them.
+leave with exit code 0 on success and 2 on a mistake in what they were given: one sentence on stderr tells
+which, and how to mend it. `python -m gshell_mi.doctor` tells whether this machine can run them.
 """
 
 
