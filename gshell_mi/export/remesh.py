@@ -26,8 +26,8 @@ def triangle_quality(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Shape of triangles, 4 √3 area / (sum of squared edge lengths): 1 if equilateral, 0 if degenerate.
 
     >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
-    >>> triangle_quality(corners, np.array([[0, 1, 2]])).round(3)
-    array([0.866])
+    >>> round(float(triangle_quality(corners, np.array([[0, 1, 2]]))[0]), 3)
+    0.866
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     squared = sum((edge ** 2).sum(1) for edge in (b - a, c - b, a - c))
