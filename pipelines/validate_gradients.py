@@ -100,7 +100,7 @@ def measure(case, resolution, seconds, stock=True):
     else:
         fd, image = kept["fd"], kept["images"][0]
     derivative = repeat(lambda seed: remembered("ours", forward(seed)), 0.003, seconds)
-    few = repeat(lambda seed: total(forward(10_000 + seed, 4)), 0.008, seconds / 3)
+    few = repeat(lambda seed: total(forward(10_000 + seed, 4)), 0.008, seconds / 3, least=32)
     first = total(forward(0))
     reverse = gradient_scenes.reverse_derivative(mover, ours, SPP, 0, weights)
     row = {"seconds": seconds, "fd": fd, "ours": mean_and_error(derivative),
