@@ -15,7 +15,7 @@ class GShellPathIntegrator(ADIntegrator):
 
     Primary visibility moves by a warp of the film that follows the silhouettes
     (:mod:`~gshell_mi.integrators.warp`); what the first surface receives, by the shadow boundaries on
-    the film (:mod:`~gshell_mi.integrators.light_edges`). Derivatives reach vertex positions, mesh
+    the film (:mod:`~gshell_mi.integrators.shadow_boundary`). Derivatives reach vertex positions, mesh
     attributes, BSDFs, emitters and the sensor's ``to_world`` in one pass; alpha is differentiable.
     Films keep any reconstruction filter, crop window and ``sample_border``. Sensors: ``perspective``;
     another one raises :class:`~gshell_mi.errors.UserError` when differentiated.
