@@ -78,11 +78,34 @@ class PinholeViews:
         direction = dr.normalize(across * film.x + down * film.y + corner)
         return mi.Ray3f(mi.Point3f(origin), direction)
 
-    def project(self, index: int, points: mi.Point3f) -> tuple[mi.Point2f, mi.Float]:
-        """Film positions in [0, 1]^2 and depths (world units along the axis) of points in one view.
+    @cached_property
+    def _inverse_table(self) -> mi.Float:
+        """Three vectors per view on the device: the rows of its basis' inverse."""
+        return mi.Float(np.linalg.inv(self.bases).ravel())
+
+    def project(self, view: int | mi.UInt32, points: mi.Point3f) -> tuple[mi.Point2f, mi.Float]:
+        """Film positions in [0, 1]^2 and depths (world units along the axis) of points.
+
+        Args:
+            view: index of the view, one for all points or one each.
+            points: world positions.
 
         Film positions of points at depth <= 0 have no meaning.
         """
-        inverse = mi.Matrix3f(np.linalg.inv(self.bases[index]))
-        scaled = inverse @ mi.Vector3f(points - mi.Point3f(self.origins[index]))
-        return mi.Point2f(scaled.x, scaled.y) / scaled.z, scaled.z
+        view = dr.opaque(mi.UInt32, view) if isinstance(view, int) else view
+        offset = points - self.origins_of(view)
+        scaled = [dr.dot(dr.gather(mi.Vector3f, self._inverse_table, 3 * view + row), offset)
+                  for row in range(3)]
+        return mi.Point2f(scaled[0], scaled[1]) / scaled[2], scaled[2]
+
+    def origins_of(self, view: mi.UInt32) -> mi.Point3f:
+        """Centres of projection of the views with index ``view``."""
+        return dr.gather(mi.Point3f, self._table, 4 * view + 3)
+
+    def pixel_size(self, view: mi.UInt32) -> mi.Float:
+        """Width of a pixel at depth 1 along the axis, in world units."""
+        return dr.gather(mi.Float, self._pixel_sizes, view)
+
+    @cached_property
+    def _pixel_sizes(self) -> mi.Float:
+        return mi.Float(np.linalg.norm(self.bases[:, :, 0], axis=1) / self.sizes[:, 0])

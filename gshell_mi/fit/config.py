@@ -57,6 +57,20 @@ class FitConfig:
     ghost_min_area: float = 0.005
     """Holes and islands smaller than this fraction of the template's area are noise and are undone."""
 
+    # --- photometric refinement: moves the surface inside the hull
+    refinement_iterations: int = 160
+    """Steps of the photometric refinement; 0 keeps the hull's shape."""
+    refinement_lr: float = 0.2
+    """Largest movement of a vertex per step, in cells; falls to 0 like a cosine."""
+    refinement_smoothing: float = 400.0
+    """Lambda of the Sobolev gradient on the template when it starts to move: whole parts move first."""
+    refinement_detail: float = 50.0
+    """Lambda at the end; falls geometrically."""
+    refinement_radiance_lr: float = 0.05
+    """Adam's step for the radiance meanwhile."""
+    refinement_outline: float = 0.001
+    """Weight of the squared distance, in cells, between silhouettes and masks; falls to half."""
+
     # --- joint stage: geometry, material and light by path tracing
     iterations: int = 200
     """Steps of the joint stage."""
@@ -105,8 +119,10 @@ class FitConfig:
             raise UserError(f"--resolution must be at least 4 cells, not {self.resolution}.")
         if self.checkpoint_seconds < 0:
             raise UserError(f"--checkpoint-seconds must not be negative, and is {self.checkpoint_seconds:g}.")
-        if self.iterations < 0:
-            raise UserError(f"--iterations must not be negative, and is {self.iterations}.")
+        for name in ("iterations", "refinement_iterations"):
+            if getattr(self, name) < 0:
+                flag = f"--{name.replace('_', '-')}"
+                raise UserError(f"{flag} must not be negative, and is {getattr(self, name)}.")
         if self.max_depth < 2:
             raise UserError(f"--max-depth must be at least 2 (direct light), not {self.max_depth}.")
         if not 0 <= self.warmup <= 1:

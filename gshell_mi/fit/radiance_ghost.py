@@ -12,14 +12,12 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from cholespy import CholeskySolverF, MatrixType
-from scipy.sparse import coo_matrix, eye
-from scipy.sparse.csgraph import laplacian
 
 from .. import losses
+from ..fields.smoothing import MeshDiffusion
 from ..views import PinholeViews
 from .config import FitConfig
-from .pixels import PixelPool
+from .pixels import PixelPool, PixelSample
 
 #: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
 #: enough that all are seen; colours fitted at full opacity would bleed what is inside into the caps.
@@ -57,9 +55,9 @@ class RadianceGhost:
         self.vertex_count = len(vertices)
         self._positions = mi.Float(vertices.ravel())
         self._faces = mi.UInt32(faces.ravel())
-        self._scene = _scene(self._positions, self._faces, self.vertex_count, len(faces))
+        self.scene = _scene(self._positions, self._faces, self.vertex_count, len(faces))
         self._offset = 1e-4 * float(np.ptp(vertices, axis=0).max())
-        self._smoother = _sobolev_solver(faces, self.vertex_count, config.ghost_smoothing)
+        self._smooth = MeshDiffusion(faces, self.vertex_count, config.ghost_smoothing)
         grey = _inverse_softplus(pixels.mean_radiance())
         self.optimizer = mi.ad.Adam(lr=config.ghost_lr)
         for side in SIDES:
@@ -88,7 +86,7 @@ class RadianceGhost:
             + config.ghost_chroma * losses.chroma_difference(front, back)
         )
         dr.backward(total)
-        self._update(("opacity", *SIDES), config.ghost_lr * 0.1**progress)
+        self.update(("opacity", *SIDES), config.ghost_lr * 0.1**progress)
         error = dr.mean(dr.ravel(dr.square(dr.detach(radiance) - sample.radiance)))
         return {"loss": total[0], "image": image[0], "mask": mask[0],
                 "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
@@ -99,7 +97,7 @@ class RadianceGhost:
         for step in range(_REFIT_STEPS):
             sample, radiance, _, _ = self._render(_EXTRA_STEP + step)
             dr.backward(losses.log_l1(radiance, sample.radiance))
-            self._update(SIDES, self.config.ghost_lr)
+            self.update(SIDES, self.config.ghost_lr)
 
     def image_error(self, opaque: np.ndarray) -> np.ndarray:
         """How badly the images are explained through each vertex if just the vertices ``opaque`` are.
@@ -122,6 +120,13 @@ class RadianceGhost:
                 dr.eval(total)
         return total.numpy()
 
+    def move(self, positions: mi.Float) -> None:
+        """Puts the vertices elsewhere: (3 V,) world positions, x0, y0, z0, x1, ..."""
+        self._positions = positions
+        parameters = mi.traverse(self.scene)
+        parameters["ghost.vertex_positions"] = positions
+        parameters.update()
+
     def _set_opacity(self, logits: np.ndarray) -> None:
         """New logits, and an optimiser without memory of what led to the old ones."""
         self.optimizer["opacity"] = mi.Float(logits.astype(np.float32))
@@ -129,11 +134,16 @@ class RadianceGhost:
 
     def _render(self, step: int) -> tuple:
         """The random pixels of a step, their radiance and coverage, and the sheets behind them."""
-        sample = self.pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
-        sheets = self._sheets(self.views.rays(sample.view, sample.film))
-        return sample, *self._composite(sheets), sheets
+        sample, _, sheets = self.look(step)
+        return sample, *self.composite(sheets), sheets
 
-    def _update(self, names: tuple[str, ...], rate: float) -> None:
+    def look(self, step: int) -> tuple[PixelSample, mi.Ray3f, list[tuple]]:
+        """The random pixels of a step, the rays through them and the sheets that these meet."""
+        sample = self.pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
+        ray = self.views.rays(sample.view, sample.film)
+        return sample, ray, self._sheets(ray)
+
+    def update(self, names: tuple[str, ...], rate: float) -> None:
         """Steps the parameters ``names`` along their Sobolev gradients; the others rest."""
         rates = {name: rate if name in names else 0.0 for name in ("opacity", *SIDES)}
         for name in rates:
@@ -163,7 +173,7 @@ class RadianceGhost:
         sheets = []
         active = dr.full(mi.Bool, True, dr.width(ray.o))
         for _ in range(self.config.ghost_sheets):
-            hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+            hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
             active = hit.is_valid()
             face = dr.gather(mi.Vector3u, self._faces, hit.prim_index, active)
             a, b, c = (dr.gather(mi.Point3f, self._positions, face[i], active) for i in range(3))
@@ -175,7 +185,7 @@ class RadianceGhost:
         dr.eval(sheets)
         return sheets
 
-    def _composite(self, sheets: list[tuple]) -> tuple[mi.Color3f, mi.Float]:
+    def composite(self, sheets: list[tuple]) -> tuple[mi.Color3f, mi.Float]:
         """Front-to-back compositing (Porter and Duff 1984, *over*) of radiance and coverage."""
         opacity, front, back = (self.optimizer[name] for name in ("opacity", "front", "back"))
         radiance, transmittance = mi.Color3f(0), mi.Float(1)
@@ -192,13 +202,6 @@ class RadianceGhost:
             transmittance *= 1 - alpha
         return radiance, 1 - transmittance
 
-    def _smooth(self, gradient: mi.Float) -> mi.Float:
-        """Sobolev gradient ``(I + lambda L)^-1 g`` (Nicolet et al. 2021), per channel."""
-        shape = (self.vertex_count, dr.width(gradient) // self.vertex_count)
-        smoothed = dr.empty(mi.TensorXf, shape=shape)
-        self._smoother.solve(mi.TensorXf(gradient, shape), smoothed)
-        return smoothed.array
-
 
 def _scene(positions: mi.Float, faces: mi.UInt32, vertex_count: int, face_count: int) -> mi.Scene:
     mesh = mi.Mesh("ghost", vertex_count, face_count)
@@ -206,16 +209,6 @@ def _scene(positions: mi.Float, faces: mi.UInt32, vertex_count: int, face_count:
     parameters["vertex_positions"], parameters["faces"] = positions, faces
     parameters.update()
     return mi.load_dict({"type": "scene", "ghost": mesh})
-
-
-def _sobolev_solver(faces: np.ndarray, vertex_count: int, smoothing: float) -> CholeskySolverF:
-    """Cholesky factor of ``I + smoothing * L`` with the combinatorial Laplacian L of the mesh."""
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-    adjacency = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count))
-    system = (eye(vertex_count) + smoothing * laplacian(adjacency + adjacency.T)).tocoo()
-    return CholeskySolverF(vertex_count, system.row.astype(np.int32), system.col.astype(np.int32),
-                           system.data.astype(np.float64), MatrixType.COO)
 
 
 def _sigmoid(x):

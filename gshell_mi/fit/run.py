@@ -1,4 +1,4 @@
-"""The fit from start to end: hull, ghost, joint stage, export; with checkpoints in between."""
+"""The fit from start to end: hull, ghost, refinement, joint stage, export; with checkpoints in between."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
 from ..export import check_output_folder, export_fit, make_output_folder, write_metrics
 from ..export.asset import write_asset
+from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
+from ..fields.moved_template import advect
 from ..fields.visual_hull import visual_hull
 from ..lattice import make_lattice
 from ..light import EnvironmentLight
@@ -30,14 +33,16 @@ from .config import FitConfig, default_output
 from .interrupt import Interrupt
 from .joint import JointStage
 from .opening import clean_opacity, close_unjustified, msdf_from_template, splat_to_lattice
+from .outlines import Outlines
 from .pixels import PixelPool
 from .progress import Progress
 from .radiance_ghost import RadianceGhost
+from .refinement import PhotometricRefinement
 
 #: Median reflectance that the first split of radiance into material and light assumes.
 _TYPICAL_REFLECTANCE = 0.5
 
-STAGES = ("hull", "ghost", "joint", "done")
+STAGES = ("hull", "ghost", "refinement", "joint", "done")
 
 
 @dataclass(frozen=True)
@@ -99,6 +104,7 @@ class _Fit:
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
         given = self.scene.subject.lattice
         self.lattice = make_lattice(given.grid, config.resolution or given.resolution)
+        self.pixels = PixelPool(self.views, self.scene.targets)
         # Nothing of an earlier fit goes before all is known to be in order.
         make_output_folder(output, keep=resume)
 
@@ -109,6 +115,8 @@ class _Fit:
             self._rewind_log()
             if self.checkpoint.stage == "ghost":
                 self._ghost()
+            if self.checkpoint.stage == "refinement":
+                self._refine()
             joint = self._joint()
             self.interrupt.check()
             with self.progress.stage("export", None), self._timed("export"):
@@ -148,7 +156,7 @@ class _Fit:
             self._enter("ghost", sdf=fields.sdf)
             return
         count = self.lattice.vertex_count
-        brightness = PixelPool(self.views, self.scene.targets).mean_radiance()
+        brightness = self.pixels.mean_radiance()
         self._enter("joint", sdf=fields.sdf, msdf=fields.msdf, deform=fields.deform,
                     radiance=np.zeros((count, 3), np.float32), known=np.zeros(count, bool),
                     light=np.float32(brightness / _TYPICAL_REFLECTANCE))
@@ -163,14 +171,12 @@ class _Fit:
         return grid.ravel()
 
     def _ghost(self) -> None:
-        sdf = self.checkpoint.arrays["sdf"]
-        self.scene.subject.set_fields(LatticeFields.closed(sdf, self.lattice.grid))
-        template = self.scene.subject.template()
-        vertices, faces, _ = template.to_numpy()
-        pixels = PixelPool(self.views, self.scene.targets)
-        ghost = RadianceGhost(vertices, faces, self.views, pixels, self.config)
+        """Finds the openings of the template."""
+        state = self.checkpoint.arrays
+        template, vertices, faces = self._template(state["sdf"])
+        ghost = RadianceGhost(vertices, faces, self.views, self.pixels, self.config)
         self._iterate("ghost", self.config.ghost_iterations, ghost.step, {"ghost": ghost.optimizer},
-                      {"sdf": sdf})
+                      {"sdf": state["sdf"]})
         clean = partial(clean_opacity, vertices=vertices, faces=faces, min_area=self.config.ghost_min_area)
         with self.progress.stage("openings", None), self._timed("ghost"):
             logits = close_unjustified(clean(ghost.smoothed_logits()), faces, ghost.image_error,
@@ -184,10 +190,52 @@ class _Fit:
         front, _ = ghost.radiance()
         msdf = msdf_from_template(logits, template, self.lattice)
         radiance, known = splat_to_lattice(mi.Float(front.ravel()), template, self.lattice)
-        radiance = radiance.numpy().reshape(-1, 3)
         light = float(np.median(front[~opened].mean(axis=1)))
-        self._enter("joint", sdf=sdf, msdf=msdf.numpy(), radiance=radiance, known=known.numpy(),
+        radiance = radiance.numpy().reshape(-1, 3)
+        self._enter("refinement", sdf=state["sdf"], msdf=msdf.numpy(), radiance=radiance, known=known.numpy(),
                     light=np.float32(light / _TYPICAL_REFLECTANCE))
+
+    def _refine(self) -> None:
+        """Moves the template inside the hull, and the fields with it."""
+        state = self.checkpoint.arrays
+        template, vertices, faces = self._template(state["sdf"])
+        solid = template.interpolate(mi.Float(state["msdf"])).numpy() > 0
+        ghost = RadianceGhost(vertices, faces, self.views, self.pixels, self.config)
+        ghost.refit(solid)
+        outlines = None
+        if self.pixels.has_alpha:
+            alphas = [target.rgba[..., 3] for target in self.scene.targets]
+            outlines = Outlines(self.views, alphas, faces, solid)
+        cell = self.lattice.spacing * _length_scale(self.scene.subject.to_world)
+        refinement = PhotometricRefinement(ghost, vertices, faces, outlines, cell, self.config)
+        self._iterate("refinement", self.config.refinement_iterations, refinement.step,
+                      {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
+        with self._timed("refinement"):
+            to_lattice = mi.Transform4f(self.scene.subject.to_world).inverse()
+            moved = to_lattice @ mi.Vector3f((refinement.positions() - vertices).T.astype(np.float32))
+            displacement, _ = splat_to_lattice(dr.ravel(mi.Vector3f(moved)), template, self.lattice)
+            fields = {name: advect(mi.Float(state[name].astype(np.float32).ravel()), displacement,
+                                   self.lattice).numpy() for name in ("sdf", "msdf", "radiance", "known")}
+            sdf = self._closed_at_border(fields["sdf"])
+            msdf = self._without_specks(sdf, fields["msdf"])
+        self._enter("joint", sdf=sdf, msdf=msdf, radiance=fields["radiance"].reshape(-1, 3),
+                    known=fields["known"] > 0.5, light=state["light"])
+
+    def _without_specks(self, sdf: np.ndarray, msdf: np.ndarray) -> np.ndarray:
+        """The mSDF without the small cuts and islands that the movement has left."""
+        template, vertices, faces = self._template(sdf)
+        logits = template.interpolate(mi.Float(msdf)).numpy() / self.lattice.spacing
+        cleaned = clean_opacity(logits, vertices, faces, self.config.ghost_min_area)
+        if (cleaned == logits).all():
+            return msdf
+        return msdf_from_template(cleaned, template, self.lattice).numpy()
+
+    def _template(self, sdf: np.ndarray) -> tuple[SurfaceMesh, np.ndarray, np.ndarray]:
+        """The template that is where ``sdf`` changes sign, its vertices and its faces."""
+        self.scene.subject.set_fields(LatticeFields.closed(sdf, self.lattice.grid))
+        template = self.scene.subject.template()
+        vertices, faces, _ = template.to_numpy()
+        return template, vertices, faces
 
     def _joint(self) -> JointStage:
         start = dict(self.checkpoint.arrays)
