@@ -60,15 +60,15 @@ class FitConfig:
     # --- photometric refinement: moves the surface inside the hull
     refinement_iterations: int = 160
     """Steps of the photometric refinement; 0 keeps the hull's shape."""
-    refinement_lr: float = 0.2
+    refinement_lr: float = 0.15
     """Largest movement of a vertex per step, in cells; falls to 0 like a cosine."""
     refinement_smoothing: float = 400.0
     """Lambda of the Sobolev gradient on the template when it starts to move: whole parts move first."""
-    refinement_detail: float = 50.0
+    refinement_detail: float = 150.0
     """Lambda at the end; falls geometrically."""
     refinement_radiance_lr: float = 0.05
     """Adam's step for the radiance meanwhile."""
-    refinement_outline: float = 0.001
+    refinement_outline: float = 0.0003
     """Weight of the squared distance, in cells, between silhouettes and masks; falls to half."""
 
     # --- joint stage: geometry, material and light by path tracing

@@ -20,7 +20,7 @@ class Outlines:
     """The silhouette of a closed mesh against the masks of all views.
 
     Contour points lie where the interpolated vertex normal is perpendicular to the line of sight, which
-    is on edges and not at vertices: that has no bias towards the outside (Hertzmann 1999).
+    is on edges and not at vertices: that has no bias towards the outside (Hertzmann and Zorin 2000).
 
     Args:
         views: the cameras.

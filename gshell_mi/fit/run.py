@@ -27,6 +27,7 @@ from ..light import EnvironmentLight
 from ..material import MaterialField, given_material
 from ..report import write_report
 from ..scene import load_fit_scene
+from ..topology import topology
 from ..views import PinholeViews
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
 from .config import FitConfig, default_output
@@ -41,6 +42,9 @@ from .refinement import PhotometricRefinement
 
 #: Median reflectance that the first split of radiance into material and light assumes.
 _TYPICAL_REFLECTANCE = 0.5
+
+#: Parts of the refinement's displacement that are tried until one does not tear the surface.
+_FRACTIONS = (1.0, 0.8, 0.6, 0.4, 0.2)
 
 STAGES = ("hull", "ghost", "refinement", "joint", "done")
 
@@ -214,12 +218,35 @@ class _Fit:
             to_lattice = mi.Transform4f(self.scene.subject.to_world).inverse()
             moved = to_lattice @ mi.Vector3f((refinement.positions() - vertices).T.astype(np.float32))
             displacement, _ = splat_to_lattice(dr.ravel(mi.Vector3f(moved)), template, self.lattice)
-            fields = {name: advect(mi.Float(state[name].astype(np.float32).ravel()), displacement,
-                                   self.lattice).numpy() for name in ("sdf", "msdf", "radiance", "known")}
-            sdf = self._closed_at_border(fields["sdf"])
-            msdf = self._without_specks(sdf, fields["msdf"])
-        self._enter("joint", sdf=sdf, msdf=msdf, radiance=fields["radiance"].reshape(-1, 3),
-                    known=fields["known"] > 0.5, light=state["light"])
+            fields = self._carried(displacement)
+        self._enter("joint", **fields, light=state["light"])
+
+    def _carried(self, displacement: mi.Float) -> dict[str, np.ndarray]:
+        """The fields carried along as much of the displacement as leaves the surface in one piece.
+
+        Where the template is thin its two sides may want to pass through one another, which no field can
+        follow: the surface tears.
+        """
+        before = {name: self.checkpoint.arrays[name] for name in ("sdf", "msdf", "radiance", "known")}
+        wanted = self._topology(before)
+        for fraction in _FRACTIONS:
+            fields = {name: advect(mi.Float(values.astype(np.float32).ravel()), fraction * displacement,
+                                   self.lattice).numpy() for name, values in before.items()}
+            fields["sdf"] = self._closed_at_border(fields["sdf"])
+            fields["msdf"] = self._without_specks(fields["sdf"], fields["msdf"])
+            fields["radiance"] = fields["radiance"].reshape(-1, 3)
+            fields["known"] = fields["known"] > 0.5
+            if self._topology(fields) == wanted:
+                return fields
+        return before
+
+    def _topology(self, fields: Mapping[str, np.ndarray]) -> tuple[int, int, int]:
+        """Components, boundary loops and pinholes of a surface."""
+        closed = LatticeFields.closed(fields["sdf"], self.lattice.grid)
+        self.scene.subject.set_fields(dataclasses.replace(closed, msdf=fields["msdf"]))
+        vertices, faces, _ = self.scene.subject.surface.to_numpy()
+        counts = topology(vertices, faces)
+        return counts.components, counts.boundary_loops, counts.pinholes
 
     def _without_specks(self, sdf: np.ndarray, msdf: np.ndarray) -> np.ndarray:
         """The mSDF without the small cuts and islands that the movement has left."""
