@@ -13,11 +13,12 @@ SIZE = 48
 #: Options of the command that make the fit short. Those of the ghost suit so small a scene and few steps.
 SHORT = ("--ghost-iterations", "100", "--ghost-batch", "4096", "--ghost-smoothing", "8",
          "--ghost-mask", "0.01", "--ghost-binary", "0.015", "--ghost-closing", "0.003", "--ghost-gain", "100",
-         "--iterations", "12", "--spp", "2", "--primal-spp", "4", "--max-depth", "2", "--light-height", "8",
+         "--refinement-iterations", "8", "--iterations", "12",
+         "--spp", "2", "--primal-spp", "4", "--max-depth", "2", "--light-height", "8",
          "--no-report")
 
 #: Added to these where openings do not matter: hardly any ghost, and the template stays closed.
-CLOSED = ("--ghost-iterations", "5", "--ghost-gain", "0")
+CLOSED = ("--ghost-iterations", "5", "--ghost-gain", "0", "--refinement-iterations", "2")
 
 
 def half_sphere(segments: int = 32) -> trimesh.Trimesh:
