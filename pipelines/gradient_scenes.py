@@ -72,7 +72,10 @@ def constant(radiance=1.0):
 
 
 def load(sensor, light, subject, **others):
-    return mi.load_dict({"type": "scene", "sensor": sensor, "light": light, "subject": subject, **others})
+    """A scene with the sensor twice, the second time with stratified samples for finite differences."""
+    return mi.load_dict({"type": "scene", "sensor": sensor,
+                         "stratified": {**sensor, "sampler": {"type": "multijitter"}},
+                         "light": light, "subject": subject, **others})
 
 
 def sphere(level=3, radius=1.0, centre=(0, 0, 0)):
@@ -276,7 +279,8 @@ SCENES = (
     GradientScene("shirt_inflating", "open garment, deforming", _shirt("inflate")),
     GradientScene("cube_constant", "cube under a constant environment (Mitsuba #1895)", _cube),
     GradientScene("cube_flat_shaded", "creases between flat faces", _flat_cube_sky),
-    GradientScene("seam_over_rough_mirror", "texture seam over a rough mirror (#1648)", _seam_over_mirror, 3),
+    GradientScene("seam_over_rough_mirror", "texture seam over a rough mirror (#1648)", _seam_over_mirror, 3,
+                  step=0.04),
     GradientScene("seam_self_shadowed", "texture seam, self-shadowed (#1648)", _seam_self_shadowed),
     GradientScene("textured_area_light", "spatially varying emitter (#1506)", _textured_light),
     GradientScene("coarse_shading_rim", "coarse mesh, normals turned away at the silhouette", _coarse),
@@ -335,12 +339,16 @@ def reverse_derivative(mover, integrator, spp, seed, weights) -> float:
     return float(dr.grad(t)[0])
 
 
-def finite_difference(mover, case, step, spp, seed) -> np.ndarray:
-    """Central difference of two stock renderings with equal seeds, H x W x 4."""
+def finite_difference(mover, case, step, spp, seed, sensor=0) -> np.ndarray:
+    """Central difference of two stock renderings with equal seeds, H x W x 4.
+
+    ``sensor``: 0, or 1 for stratified samples (less noise, but longer to compile).
+    """
     integrator = mi.load_dict({"type": "path", "max_depth": case.depth, "hide_emitters": case.hide_emitters})
     images = []
     for t in (step, -step):
         mover.to(mi.Float(t))
-        images.append(np.array(mi.render(mover.scene, integrator=integrator, spp=spp, seed=1000 + seed)))
+        images.append(np.array(mi.render(mover.scene, sensor=sensor, integrator=integrator, spp=spp,
+                                         seed=1000 + seed)))
     mover.to(mi.Float(0))
     return (images[0] - images[1]) / (2 * step)

@@ -6,7 +6,8 @@ For every scene of ``pipelines/gradient_scenes.py``: the derivative of a weighte
 and the gradient image, by central finite differences of the stock ``path`` integrator (equal seeds on both
 sides, Richardson's extrapolation), by ``gshell_path`` in forward and reverse mode, and by Mitsuba's
 ``prb_projective`` and (at depth 2) ``direct_projective``. Figures after ± are one standard error over
-independent repeats. Measurements are kept in ``out/gradients``; the page shows all that are there.
+independent repeats. Measurements are kept in ``out/gradients``; the page shows all that are there, and of
+other scenes what it showed before.
 """
 
 import os
@@ -85,7 +86,7 @@ def measure(case, resolution, seconds, stock=True):
 
     def finite_difference(seed):
         """Richardson's extrapolation of steps h and 2 h; the image is that of h / 2."""
-        half, one, two = (gradient_scenes.finite_difference(mover, case, factor * case.step, spp, seed)
+        half, one, two = (gradient_scenes.finite_difference(mover, case, factor * case.step, spp, seed, 1)
                           for factor, spp in ((0.5, FD_SPP // 2), (1, FD_SPP), (2, FD_SPP // 2)))
         remembered("fd", half)
         return (4 * total(one) - total(two)) / 3
@@ -171,7 +172,20 @@ correlation).
 """
 
 
+def rows_on_page(path):
+    """Name of the scene -> row of the table, as text, of a page written before."""
+    lines = path.read_text().splitlines() if path.exists() else []
+    names = {case.name for case in gradient_scenes.SCENES}
+    rows = {line.split("|")[1].strip(): line for line in lines if line.count("|") == 12}
+    return {name: line for name, line in rows.items() if name in names}
+
+
 def write_page(rows, resolution):
+    """Writes the page and the images of ``rows``; scenes without a row stay as they are on the page."""
+    page = ROOT / "docs" / "gradients.md"
+    table = {**rows_on_page(page), **{row["case"].name: format_row(row) for row in rows}}
+    cases = [case for case in gradient_scenes.SCENES if case.name in table]
+    right = sum(table[case.name].split("|")[6].strip() == "yes" for case in cases)
     folder = ROOT / "docs" / "images"
     folder.mkdir(parents=True, exist_ok=True)
     for row in rows:
@@ -185,15 +199,15 @@ def write_page(rows, resolution):
              f"| scene | depth | FD | gshell_path, {SPP} spp | bias | right | 4 spp "
              "| corr. | fwd - rev | prb_projective | direct_projective |\n",
              "|---|---|---|---|---|---|---|---|---|---|---|\n"]
-    lines += [format_row(row) + "\n" for row in rows]
-    lines.append(f"\n{sum(map(passes, rows))} of {len(rows)} scenes are right.\n\n## Gradient images\n\n"
+    lines += [table[case.name] + "\n" for case in cases]
+    lines.append(f"\n{right} of {len(cases)} scenes are right.\n\n## Gradient images\n\n"
                  "Finite differences, `gshell_path`, difference; red positive, blue negative.\n\n")
-    lines += [f"**{row['case'].name}**: {row['case'].about}\n\n"
-              f"![{row['case'].name}](images/gradients_{row['case'].name}.png)\n\n" for row in rows]
+    lines += [f"**{case.name}**: {case.about}\n\n![{case.name}](images/gradients_{case.name}.png)\n\n"
+              for case in cases]
     notes = Path(__file__).with_name("gradients_notes.md")
     if notes.exists():
         lines.append(notes.read_text())
-    (ROOT / "docs" / "gradients.md").write_text("".join(lines).rstrip() + "\n")
+    page.write_text("".join(lines).rstrip() + "\n")
 
 
 def main():
