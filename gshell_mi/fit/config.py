@@ -71,6 +71,10 @@ class FitConfig:
     refinement_outline: float = 0.0003
     """Weight of the squared distance, in cells, between silhouettes and masks; falls to half."""
 
+    refinement_gain: float = 0.85
+    """The refinement is kept if it brings the image error of views that it did not see below this fraction.
+    Where radiance depends much on the view (gloss), it may explain the views it sees by a wrong shape."""
+
     # --- joint stage: geometry, material and light by path tracing
     iterations: int = 200
     """Steps of the joint stage."""

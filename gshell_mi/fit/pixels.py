@@ -29,15 +29,25 @@ class PixelSample:
 
 
 class PixelPool:
-    """The pixels of every target, whatever their sizes, each equally likely to be drawn."""
+    """The pixels of targets, whatever their sizes, each equally likely to be drawn.
 
-    def __init__(self, views: PinholeViews, targets: list[Target]):
-        counts = views.sizes.prod(axis=1)
+    Args:
+        views: the cameras.
+        targets: their images.
+        chosen: indices of the views whose pixels are drawn; default all.
+    """
+
+    def __init__(self, views: PinholeViews, targets: list[Target], chosen: np.ndarray | None = None):
+        chosen = np.arange(len(views)) if chosen is None else chosen
+        targets = [targets[index] for index in chosen]
+        counts = views.sizes[chosen].prod(axis=1)
         self._pixels = mi.Float(np.concatenate([target.rgba.ravel() for target in targets]))
-        self._view = mi.UInt32(np.repeat(np.arange(len(views)), counts))
+        self._view = mi.UInt32(np.repeat(chosen, counts))
         self._width = mi.UInt32(views.sizes[:, 0])
         self._height = mi.UInt32(views.sizes[:, 1])
-        self._first = mi.UInt32(np.concatenate([[0], np.cumsum(counts)[:-1]]))
+        first = np.zeros(len(views), np.int64)
+        first[chosen] = np.cumsum(counts) - counts
+        self._first = mi.UInt32(first)
         self.count = int(counts.sum())
         self.has_alpha = all(target.has_alpha for target in targets)
         color = sum(float(target.rgba[..., :3].sum(dtype=np.float64)) for target in targets)

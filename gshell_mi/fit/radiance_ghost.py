@@ -120,6 +120,17 @@ class RadianceGhost:
                 dr.eval(total)
         return total.numpy()
 
+    def unexplained(self, pixels: PixelPool) -> float:
+        """Mean image loss on other pixels than those that the ghost was trained on."""
+        total = mi.Float(0)
+        with dr.suspend_grad():
+            for step in range(_ERROR_STEPS):
+                sample = pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=_EXTRA_STEP + step)
+                radiance, _ = self.composite(self._sheets(self.views.rays(sample.view, sample.film)))
+                total += losses.log_l1(radiance, sample.radiance)
+                dr.eval(total)
+        return float(total[0]) / _ERROR_STEPS
+
     def move(self, positions: mi.Float) -> None:
         """Puts the vertices elsewhere: (3 V,) world positions, x0, y0, z0, x1, ..."""
         self._positions = positions

@@ -43,6 +43,12 @@ from .refinement import PhotometricRefinement
 #: Median reflectance that the first split of radiance into material and light assumes.
 _TYPICAL_REFLECTANCE = 0.5
 
+#: What the joint stage starts from.
+_SURFACE = ("sdf", "msdf", "radiance", "known")
+
+#: Every eighth view is kept from the refinement and judges it.
+_HOLD_OUT = 8
+
 #: Parts of the refinement's displacement that are tried until one does not tear the surface.
 _FRACTIONS = (1.0, 0.8, 0.6, 0.4, 0.2)
 
@@ -204,8 +210,13 @@ class _Fit:
         state = self.checkpoint.arrays
         template, vertices, faces = self._template(state["sdf"])
         solid = template.interpolate(mi.Float(state["msdf"])).numpy() > 0
-        ghost = RadianceGhost(vertices, faces, self.views, self.pixels, self.config)
+        every = np.arange(len(self.views))
+        held_out = every[::_HOLD_OUT]
+        seen = np.setdiff1d(every, held_out) if len(every) > 1 else every
+        known, unknown = (PixelPool(self.views, self.scene.targets, chosen) for chosen in (seen, held_out))
+        ghost = RadianceGhost(vertices, faces, self.views, known, self.config)
         ghost.refit(solid)
+        before = ghost.unexplained(unknown)
         outlines = None
         if self.pixels.has_alpha:
             alphas = [target.rgba[..., 3] for target in self.scene.targets]
@@ -215,19 +226,25 @@ class _Fit:
         self._iterate("refinement", self.config.refinement_iterations, refinement.step,
                       {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
         with self._timed("refinement"):
-            to_lattice = mi.Transform4f(self.scene.subject.to_world).inverse()
-            moved = to_lattice @ mi.Vector3f((refinement.positions() - vertices).T.astype(np.float32))
-            displacement, _ = splat_to_lattice(dr.ravel(mi.Vector3f(moved)), template, self.lattice)
-            fields = self._carried(displacement)
+            ghost.move(mi.Float(refinement.positions().ravel()))
+            ghost.refit(solid)
+            fields = {name: state[name] for name in _SURFACE}
+            if ghost.unexplained(unknown) < self.config.refinement_gain * before:
+                fields = self._carried(fields, self._displacement(refinement.positions() - vertices, template))
         self._enter("joint", **fields, light=state["light"])
 
-    def _carried(self, displacement: mi.Float) -> dict[str, np.ndarray]:
+    def _displacement(self, movement: np.ndarray, template: SurfaceMesh) -> mi.Float:
+        """The movement of the template's vertices, (V, 3) in world units, as a lattice field."""
+        to_lattice = mi.Transform4f(self.scene.subject.to_world).inverse()
+        moved = to_lattice @ mi.Vector3f(movement.T.astype(np.float32))
+        return splat_to_lattice(dr.ravel(mi.Vector3f(moved)), template, self.lattice)[0]
+
+    def _carried(self, before: dict[str, np.ndarray], displacement: mi.Float) -> dict[str, np.ndarray]:
         """The fields carried along as much of the displacement as leaves the surface in one piece.
 
         Where the template is thin its two sides may want to pass through one another, which no field can
         follow: the surface tears.
         """
-        before = {name: self.checkpoint.arrays[name] for name in ("sdf", "msdf", "radiance", "known")}
         wanted = self._topology(before)
         for fraction in _FRACTIONS:
             fields = {name: advect(mi.Float(values.astype(np.float32).ravel()), fraction * displacement,

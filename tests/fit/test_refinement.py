@@ -35,7 +35,7 @@ def pattern(point: mi.Point3f) -> mi.Color3f:
 
 
 @pytest.fixture(scope="module")
-def capture() -> tuple[PinholeViews, PixelPool, list[np.ndarray]]:
+def capture() -> tuple[PinholeViews, PixelPool, list[Target]]:
     """A sphere of RADIUS with ``pattern`` as its radiance, seen from all around."""
     views = PinholeViews.from_sensors(cameras())
     targets = []
@@ -51,15 +51,19 @@ def capture() -> tuple[PinholeViews, PixelPool, list[np.ndarray]]:
         samples = np.concatenate([color.numpy(), (root > 0).numpy()[None]]).reshape(4, SIZE, 8, SIZE, 8)
         rgba = np.ascontiguousarray(samples.mean(axis=(2, 4)).transpose(1, 2, 0).astype(np.float32))
         targets.append(Target(None, rgba, True))
-    return views, PixelPool(views, targets), [target.rgba[..., 3] for target in targets]
+    return views, PixelPool(views, targets), targets
+
+
+def alphas(targets: list[Target]) -> list[np.ndarray]:
+    return [target.rgba[..., 3] for target in targets]
 
 
 def refinement(capture, vertices, faces, with_outlines) -> PhotometricRefinement:
-    views, pixels, alphas = capture
+    views, pixels, targets = capture
     solid = np.ones(len(vertices), bool)
     ghost = RadianceGhost(vertices, faces, views, pixels, CONFIG)
     ghost.refit(solid)
-    outlines = Outlines(views, alphas, faces, solid) if with_outlines else None
+    outlines = Outlines(views, alphas(targets), faces, solid) if with_outlines else None
     return PhotometricRefinement(ghost, vertices, faces, outlines, CELL, CONFIG)
 
 
@@ -86,7 +90,7 @@ def test_bump_goes_down_without_outlines(capture):
 
 
 def test_outline_of_the_true_sphere_is_the_masks(capture):
-    views, _, alphas = capture
+    views, _, targets = capture
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     faces = np.array(mesh.faces)
     pixel = 3 * np.linalg.norm(views.bases[0][:, 0]) / SIZE
@@ -94,7 +98,7 @@ def test_outline_of_the_true_sphere_is_the_masks(capture):
     def distance(scale: float) -> float:
         vertices = scale * np.array(mesh.vertices)
         ghost = RadianceGhost(vertices, faces, views, capture[1], CONFIG)
-        outlines = Outlines(views, alphas, faces, np.ones(len(vertices), bool))
+        outlines = Outlines(views, alphas(targets), faces, np.ones(len(vertices), bool))
         loss = outlines.loss(mi.Float(vertices.ravel()), ghost.scene, np.arange(len(views)))
         return float(np.sqrt(loss[0])) / pixel
 
@@ -104,10 +108,10 @@ def test_outline_of_the_true_sphere_is_the_masks(capture):
 
 
 def test_outline_loss_derivative_is_that_of_a_scaled_sphere(capture):
-    views, pixels, alphas = capture
+    views, pixels, targets = capture
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=1.05 * RADIUS)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-    outlines = Outlines(views, alphas, faces, np.ones(len(vertices), bool))
+    outlines = Outlines(views, alphas(targets), faces, np.ones(len(vertices), bool))
     ghost = RadianceGhost(vertices, faces, views, pixels, CONFIG)
     every = np.arange(len(views))
 
@@ -132,3 +136,20 @@ def test_attached_barycentrics():
     dr.backward(weights.y)  # x over the length of the first edge
     # Moving the corner at the origin along x by h: u = (0.25 - 0.5 h ...) by hand, du/dx0 = u - 1 + v.
     assert np.allclose(dr.grad(positions).numpy(), [-0.25, 0, 0, -0.25, 0, 0, -0.5, 0, 0], atol=1e-6)
+
+
+def test_views_it_did_not_see_judge_the_refinement(capture):
+    """The bump is worse on other views than the sphere; a pool draws from its chosen views only."""
+    views, _, targets = capture
+    vertices, faces = dented()
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    seen, unseen = np.arange(len(views)) % 3 > 0, np.arange(len(views)) % 3 == 0
+    known, unknown = (PixelPool(views, targets, np.flatnonzero(chosen)) for chosen in (seen, unseen))
+    drawn = unknown.sample(4096, seed=0, step=0)
+    assert set(np.unique(drawn.view)) == set(np.flatnonzero(unseen))
+    errors = []
+    for points in (vertices, np.array(sphere.vertices)):
+        ghost = RadianceGhost(points, faces, views, known, CONFIG)
+        ghost.refit(np.ones(len(points), bool))
+        errors.append(ghost.unexplained(unknown))
+    assert errors[1] < 0.95 * errors[0]
