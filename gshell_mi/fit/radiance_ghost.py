@@ -125,7 +125,7 @@ class RadianceGhost:
         total = mi.Float(0)
         with dr.suspend_grad():
             for step in range(_ERROR_STEPS):
-                sample = pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=_EXTRA_STEP + step)
+                sample = pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
                 radiance, _ = self.composite(self._sheets(self.views.rays(sample.view, sample.film)))
                 total += losses.log_l1(radiance, sample.radiance)
                 dr.eval(total)

@@ -230,7 +230,8 @@ class _Fit:
             ghost.refit(solid)
             fields = {name: state[name] for name in _SURFACE}
             if ghost.unexplained(unknown) < self.config.refinement_gain * before:
-                fields = self._carried(fields, self._displacement(refinement.positions() - vertices, template))
+                movement = refinement.positions() - vertices
+                fields = self._carried(fields, self._displacement(movement, template))
         self._enter("joint", **fields, light=state["light"])
 
     def _displacement(self, movement: np.ndarray, template: SurfaceMesh) -> mi.Float:
