@@ -289,7 +289,7 @@ SCENES = (
     GradientScene("box_filter", "box reconstruction filter", _box_filter),
     GradientScene("occluder", "static occluder in front", _occluder),
     GradientScene("open_box", "interreflection in an open box", _open_box, 3),
-    GradientScene("thin_sheet_edge_on", "sheet seen almost from its edge", _thin_sheet, step=0.06),
+    GradientScene("thin_sheet_edge_on", "sheet seen almost from its edge", _thin_sheet, step=0.015),
     GradientScene("shadow_environment", "shadow on a plane, environment", _shadow_on_plane(constant)),
     GradientScene("shadow_area_light", "shadow on a plane, area light", _shadow_on_plane(_area_light)),
     GradientScene("shadow_point_light", "hard shadow, point light", _shadow_on_plane(_point_light)),
