@@ -1,7 +1,9 @@
-"""Everything that depends on the version of Mitsuba, in one place."""
+"""Everything that depends on the versions and the quirks of other packages, in one place."""
 
 from __future__ import annotations
 
+import warnings
+from types import ModuleType
 from typing import Any
 
 import drjit as dr
@@ -68,3 +70,14 @@ def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> mi.Mesh
     write_mesh(mesh, mi.Float(np.ascontiguousarray(vertices, np.float32).ravel()),
                mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel()))
     return mesh
+
+
+def colour_science() -> ModuleType:
+    """The package colour-science, imported when first needed, as that takes a second.
+
+    It changes how NumPy prints and warns of packages that it would use for plots; both are undone.
+    """
+    with np.printoptions(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour
+    return colour

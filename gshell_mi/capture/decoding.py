@@ -7,13 +7,13 @@ import io
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from types import ModuleType
 
 import mitsuba as mi
 import numpy as np
 from PIL import ExifTags, Image, ImageCms
 from skimage.io import imread
 
+from ..compat import colour_science
 from ..errors import UserError
 
 #: Formats that hold floating point values, linear unless told otherwise, colour premultiplied by alpha.
@@ -135,7 +135,7 @@ class ColorDecoding:
     transfer: str | None = None
 
     def __post_init__(self):
-        colour = _colour_science()
+        colour = colour_science()
         _known(self.color_space, colour.RGB_COLOURSPACES, "--color-space", "colour space")
         if self.transfer not in (None, "linear"):
             _known(self.transfer, colour.CCTF_DECODINGS, "--transfer", "transfer function")
@@ -153,7 +153,7 @@ class ColorDecoding:
         return np.maximum(linear, 0.0, out=linear)
 
     def _decode(self, values: np.ndarray, *, integer: bool) -> np.ndarray:
-        colour = _colour_science()
+        colour = colour_science()
         if self.transfer == "linear" or (self.transfer is None and not integer):
             return values
         if self.transfer is None:
@@ -163,17 +163,10 @@ class ColorDecoding:
     @cached_property
     def _to_rec709(self) -> np.ndarray | None:
         """Of row vectors."""
-        colour = _colour_science()
+        colour = colour_science()
         matrix = colour.matrix_RGB_to_RGB(colour.RGB_COLOURSPACES[self.color_space],
                                           colour.RGB_COLOURSPACES[_REC709])
         return None if np.allclose(matrix, np.eye(3), atol=1e-3) else matrix.T.astype(np.float32)
-
-
-def _colour_science() -> ModuleType:
-    """Imported when first needed, as that takes a second; it changes how NumPy prints, which is undone."""
-    with np.printoptions():
-        import colour
-    return colour
 
 
 def _known(name: str, names: object, option: str, what: str) -> None:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 from skimage.metrics import structural_similarity
 
+from ..compat import colour_science
 from ..errors import UserError
 from ..images import over_white, psnr
 from ..targets import load_target
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # of packages that it would use for plots
-    import colour
 
 #: The names of the scores, whether greater is better, and what they are.
 IMAGE_SCORES = {
@@ -81,14 +77,19 @@ def image_scores(image: np.ndarray, reference: np.ndarray) -> tuple[dict[str, fl
         "ssim": float(structural_similarity(left, right, channel_axis=2, data_range=1.0)),
         "flip": float(flip),
         "relative_mse": float((squared / (reference[..., :3] ** 2 + _RELATIVE_FLOOR)).mean()),
-        "delta_e": float(colour.delta_E(_lab(left[union]), _lab(right[union]), method="CIE 2000").mean())
+        "delta_e": float(_delta_e(left[union], right[union]).mean())
         if union.any() else 0.0,
         "mask_iou": float(both.sum() / union.sum()) if union.any() else 1.0,
     }, np.asarray(flip_map)
 
 
 def _lab(srgb: np.ndarray) -> np.ndarray:
+    colour = colour_science()
     return colour.XYZ_to_Lab(colour.sRGB_to_XYZ(srgb))
+
+
+def _delta_e(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return colour_science().delta_E(_lab(first), _lab(second), method="CIE 2000")
 
 
 def _size(image: np.ndarray) -> str:
