@@ -5,10 +5,12 @@ The rooms, in the order in which data flows through them:
 - ``lattice``, ``fields``, ``extraction``: from signed distances on a lattice to a triangle mesh
 - ``shape``: the same as a Mitsuba shape, ``{"type": "gshell"}``
 - ``integrators``: rendering with right derivatives, ``{"type": "gshell_path"}`` and ``gshell_mask``
+- ``capture``: photographs with known cameras become a fit scene, ``python -m gshell_mi.capture``
 - ``targets``, ``views``, ``scene``: what a fit starts from
 - ``losses``, ``material``, ``light``, ``fit``: the optimisation, ``python -m gshell_mi.fit``
-- ``images``, ``topology``, ``export``: what it leaves behind
-- ``doctor``: whether this machine can run it all
+- ``images``, ``topology``, ``export``, ``turntable``, ``report``: what it leaves behind
+- ``evaluation``, ``compare``: how good it is
+- ``command_line``, ``doctor``, ``errors``: what the commands share; whether this machine can run it all
 
 Importing the package sets no variant; its plugins register for the variant in use and for every later one.
 

@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from ..doctor import ensure_variant
+from ..command_line import run_command
 from ..errors import UserError
 from .config import CaptureConfig
 
@@ -39,24 +39,18 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    try:
-        given = tyro.cli(_Arguments, args=arguments, prog="python -m gshell_mi.capture",
-                         description="Turn photographs with known cameras into a scene for gshell_mi.fit.",
-                         config=(tyro.conf.FlagCreatePairsOff,))
-        ensure_variant(given.variant)
-        if given.output is None and not given.check:
-            raise UserError("Nothing to do: give the scene to write with -o, or --check for a look at one.")
-        if given.output is not None:
-            _import(given)
-        if given.check:
-            _check(given.output or given.source, warn=given.output is None)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("Interrupted; nothing was written.", file=sys.stderr)
-        return 130
-    return 0
+    return run_command("capture", "Turn photographs with known cameras into a scene for gshell_mi.fit.",
+                       _Arguments, _capture, arguments,
+                       interrupted=lambda _: "Interrupted; nothing was written.")
+
+
+def _capture(given: _Arguments) -> None:
+    if given.output is None and not given.check:
+        raise UserError("Nothing to do: give the scene to write with -o, or --check for a look at one.")
+    if given.output is not None:
+        _import(given)
+    if given.check:
+        _check(given.output or given.source, warn=given.output is None)
 
 
 def _import(given: _Arguments) -> None:

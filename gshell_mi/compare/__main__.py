@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ..doctor import ensure_variant
+from ..command_line import run_command
 from ..errors import UserError
 from ..evaluation import IMAGE_SCORES
 
@@ -46,22 +46,19 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
+    return run_command("compare", "Score images, a fit or a mesh against a reference.", _Arguments, _score,
+                       arguments)
+
+
+def _score(given: _Arguments) -> None:
     try:
-        given = tyro.cli(_Arguments, args=arguments, prog="python -m gshell_mi.compare",
-                         description="Score images, a fit or a mesh against a reference.")
-        ensure_variant(given.variant)
         result = _compare(given)
         if given.json:
             given.json.write_text(json.dumps(result, indent=1))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     except OSError as error:
-        print(f"error: '{error.filename}' cannot be written ({error.strerror}); choose another place.",
-              file=sys.stderr)
-        return 2
+        raise UserError(f"'{error.filename}' cannot be written ({error.strerror}); choose another "
+                        f"place.") from error
     _show(result)
-    return 0
 
 
 def _compare(given: _Arguments) -> dict:

@@ -10,8 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from ..doctor import ensure_variant
-from ..errors import UserError
+from ..command_line import run_command
 from .asset import AssetConfig, write_asset
 
 
@@ -26,21 +25,17 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    try:
-        given = tyro.cli(_Arguments, args=arguments, prog="python -m gshell_mi.export",
-                         description="Write the object of a fit for Blender, game engines and simulators.",
-                         config=(tyro.conf.FlagCreatePairsOff,))
-        ensure_variant(given.variant)
-        report = write_asset(given.output, given.config)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return run_command("export", "Write the object of a fit for Blender, game engines and simulators.",
+                       _Arguments, _export, arguments)
+
+
+def _export(given: _Arguments) -> None:
+    report = write_asset(given.output, given.config)
     atlas = f"{report['charts']} charts" if report["charts"] else "colours at the vertices, no UV atlas"
     print(f"{given.output / 'mesh.glb'}: {report['faces']} faces, {atlas}")
     if "remeshed_faces" in report:
         print(f"{given.output / 'remeshed.ply'}: {report['remeshed_faces']} faces, worst quality "
               f"{report['remeshed_min_quality']:.3f}")
-    return 0
 
 
 if __name__ == "__main__":

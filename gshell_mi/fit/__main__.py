@@ -10,8 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from ..doctor import ensure_variant
-from ..errors import UserError
+from ..command_line import run_command
 from .config import FitConfig, default_output
 
 
@@ -38,30 +37,27 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    try:
-        given = tyro.cli(_Arguments, args=arguments, prog="python -m gshell_mi.fit",
-                         description="Reconstruct an open or closed surface, its material and its light.",
-                         config=(tyro.conf.FlagCreatePairsOff,))
-        ensure_variant(given.variant)
-        # Only now, as plugins and types exist per variant.
-        from .run import fit_scene
+    return run_command("fit", "Reconstruct an open or closed surface, its material and its light.",
+                       _Arguments, _fit, arguments, interrupted=_how_to_continue)
 
-        result = fit_scene(given.scene, given.output, targets=given.targets, config=given.config,
-                           resume=given.resume, overwrite=given.overwrite, report=not given.no_report,
-                           quiet=given.quiet)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        output = given.output or default_output(given.scene)
-        print(f"Interrupted; continue with --resume (the last checkpoint is in '{output}').", file=sys.stderr)
-        return 130
+
+def _fit(given: _Arguments) -> None:
+    # Only now, as plugins and types exist per variant.
+    from .run import fit_scene
+
+    result = fit_scene(given.scene, given.output, targets=given.targets, config=given.config,
+                       resume=given.resume, overwrite=given.overwrite, report=not given.no_report,
+                       quiet=given.quiet)
     counts = result.metrics["counts"]
     print(f"{result.output}: {counts['vertices']} vertices, {counts['faces']} faces, "
           f"{counts['boundary_loops']} boundary loops, {counts['components']} components, "
           f"{result.metrics['psnr_training']:.2f} dB on the training views, "
           f"{result.metrics['seconds']['total']:.0f} s")
-    return 0
+
+
+def _how_to_continue(given: _Arguments) -> str:
+    output = given.output or default_output(given.scene)
+    return f"Interrupted; continue with --resume (the last checkpoint is in '{output}')."
 
 
 if __name__ == "__main__":

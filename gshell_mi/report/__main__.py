@@ -10,8 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from ..doctor import ensure_variant
-from ..errors import UserError
+from ..command_line import run_command
 from .report import ReportConfig, write_report
 
 
@@ -26,15 +25,12 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    try:
-        given = tyro.cli(_Arguments, args=arguments, prog="python -m gshell_mi.report",
-                         description="Write report.html of a fit: one page that needs no network.")
-        ensure_variant(given.variant)
-        print(write_report(given.folder, given.config))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command("report", "Write report.html of a fit: one page that needs no network.", _Arguments,
+                       _report, arguments)
+
+
+def _report(given: _Arguments) -> None:
+    print(write_report(given.folder, given.config))
 
 
 if __name__ == "__main__":

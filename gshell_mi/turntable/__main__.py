@@ -12,8 +12,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ..doctor import ensure_variant
-from ..errors import UserError
+from ..command_line import run_command
 from .turntable import TurntableConfig, render_turntable, write_video
 
 
@@ -35,24 +34,17 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    try:
-        given = tyro.cli(_Arguments, args=arguments, prog="python -m gshell_mi.turntable",
-                         description="Render a turntable of a fitted object.",
-                         config=(tyro.conf.FlagCreatePairsOff,))
-        ensure_variant(given.variant)
-        frames = render_turntable(given.folder, given.config, envmap=given.envmap)
-        columns = (TextColumn("turntable"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True), disable=given.quiet) as progress:
-            tracked = progress.track(frames, total=given.config.frames)
-            files = write_video(tracked, given.output or given.folder / "turntable.mp4", given.config.fps)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
-        return 130
+    return run_command("turntable", "Render a turntable of a fitted object.", _Arguments, _turntable,
+                       arguments)
+
+
+def _turntable(given: _Arguments) -> None:
+    frames = render_turntable(given.folder, given.config, envmap=given.envmap)
+    columns = (TextColumn("turntable"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=given.quiet) as progress:
+        tracked = progress.track(frames, total=given.config.frames)
+        files = write_video(tracked, given.output or given.folder / "turntable.mp4", given.config.fps)
     print(*files, sep="\n")
-    return 0
 
 
 if __name__ == "__main__":

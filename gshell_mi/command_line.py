@@ -1,0 +1,45 @@
+"""What all commands of the package have in common: arguments in, an exit code out."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import TypeVar
+
+import tyro
+
+from .doctor import ensure_variant
+from .errors import UserError
+
+Arguments = TypeVar("Arguments")
+
+
+def run_command(name: str, description: str, arguments: type[Arguments], work: Callable[[Arguments], None],
+                given: list[str] | None, *,
+                interrupted: Callable[[Arguments], str] = lambda _: "Interrupted.") -> int:
+    """Parses the arguments, sets their Mitsuba variant and does the work.
+
+    Args:
+        name: the package that is the command, as in ``python -m gshell_mi.NAME``.
+        description: one sentence for ``--help``.
+        arguments: a dataclass with a field ``variant``.
+        work: what the command does; only now may it import modules that need a variant.
+        given: the arguments; None: those of the process.
+        interrupted: what to say after Ctrl-C.
+
+    Returns:
+        The exit code: 0, 2 after a user's mistake (told on stderr in one sentence), 130 after Ctrl-C.
+    """
+    try:
+        parsed = tyro.cli(arguments, args=given, prog=f"python -m gshell_mi.{name}", description=description,
+                          config=(tyro.conf.FlagCreatePairsOff,))
+        try:
+            ensure_variant(parsed.variant)
+            work(parsed)
+        except KeyboardInterrupt:
+            print(interrupted(parsed), file=sys.stderr)
+            return 130
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
