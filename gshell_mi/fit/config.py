@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from ..errors import UserError
+
+#: Fields that are weights of losses.
+WEIGHTS = ("ghost_mask", "ghost_daylight", "ghost_binary", "ghost_closing", "ghost_chroma", "joint_mask",
+           "hole_opening", "hole_closing", "visible_outside", "visible_inside", "sdf_sign", "eikonal",
+           "template_smoothness", "material_smoothness", "albedo_chroma", "light_smoothness", "light_grey",
+           "flexicubes_deviation")
 
 
 @dataclass(frozen=True)
@@ -106,14 +113,35 @@ class FitConfig:
     """Adam's step for the environment map (logarithm of its radiance)."""
     light_height: int = 32
     """Rows of the optimised environment map; it has twice as many columns."""
+    # --- losses of the joint stage: docs/losses.md has their formulas. Weight 0 leaves one out.
+    image_loss: Literal["log_l1", "smape", "relative_l2", "l1"] = "log_l1"
+    """What compares a render with its target."""
     joint_mask: float = 4.0
     """Weight of the mask loss."""
+    hole_opening: float = 0.0
+    """Weight of what pulls the mSDF of the surface below 0, so that openings appear and can be judged."""
+    hole_closing: float = 0.0
+    """Weight of what pulls the mSDF of visible boundaries above 0, so that holes shut."""
+    visible_outside: float = 0.0
+    """Weight of the mSDF that is seen outside the masks."""
+    visible_inside: float = 0.0
+    """Weight of negative mSDF where a mask is covered and no surface is."""
+    sdf_sign: float = 0.0
+    """Weight of the cross-entropy between the signs of neighbouring lattice vertices: removes floaters."""
+    eikonal: float = 0.0
+    """Weight of the squared difference between the slope of the signed distance and 1, near the surface."""
+    template_smoothness: float = 0.0
+    """Weight of the squared difference of the template's normals along its edges."""
     material_smoothness: float = 0.01
     """Weight of the difference between the material at a point and at a point nearby."""
-    flexicubes_deviation: float = 0.01
-    """Weight of the FlexiCubes regulariser, in cells; only used with that grid."""
+    albedo_chroma: float = 0.0
+    """Weight of the difference between the chroma of the base colour and of the image that shows it."""
+    light_smoothness: float = 0.0
+    """Weight of the difference between neighbouring texels of the light's logarithm."""
     light_grey: float = 0.005
     """Weight of the grey-world prior of the light."""
+    flexicubes_deviation: float = 0.01
+    """Weight of the FlexiCubes regulariser, in cells; only used with that grid."""
 
     def __post_init__(self):
         for name in ("ghost_iterations", "ghost_batch", "ghost_sheets", "spp", "primal_spp", "light_height"):
@@ -127,6 +155,10 @@ class FitConfig:
             if getattr(self, name) < 0:
                 flag = f"--{name.replace('_', '-')}"
                 raise UserError(f"{flag} must not be negative, and is {getattr(self, name)}.")
+        for name in WEIGHTS:
+            if getattr(self, name) < 0:
+                raise UserError(f"--{name.replace('_', '-')} is a weight and must not be negative, "
+                                f"and is {getattr(self, name):g}.")
         if self.max_depth < 2:
             raise UserError(f"--max-depth must be at least 2 (direct light), not {self.max_depth}.")
         if not 0 <= self.warmup <= 1:

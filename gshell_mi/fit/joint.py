@@ -7,12 +7,12 @@ import mitsuba as mi
 import numpy as np
 
 from .. import losses
-from ..extraction.flexicubes import deviation
 from ..fields.smoothing import LatticeDiffusion
 from ..light import EnvironmentLight
 from ..material import ATTRIBUTES, MaterialField, principled
 from ..scene import FitScene
 from .config import FitConfig
+from .regularisers import Regularisers
 
 
 class JointStage:
@@ -44,6 +44,7 @@ class JointStage:
         self.shading = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
         if light:
             self.shading["light"] = light.log_radiance
+        self._regularisers = Regularisers(fit, self.scene, material, light, config)
 
     @property
     def optimizers(self) -> dict[str, mi.ad.Adam]:
@@ -59,9 +60,10 @@ class JointStage:
                           integrator=self._integrator, spp=config.primal_spp, spp_grad=config.spp,
                           seed=2 * iteration, seed_grad=2 * iteration + 1)
         target = self._targets[index]
-        color = losses.log_l1(image[..., :3], target[..., :3])
+        color = losses.IMAGE_LOSSES[config.image_loss](image[..., :3], target[..., :3])
         mask = losses.mask_l2(image[..., 3], target[..., 3]) if self._has_alpha else mi.Float(0)
-        total = color + config.joint_mask * mask + self._regularisation()
+        regularisation, terms = self._regularisers(index)
+        total = color + config.joint_mask * mask + regularisation
         dr.backward(total)
         progress = iteration / max(config.iterations, 1)
         decay = 0.1**progress
@@ -71,6 +73,7 @@ class JointStage:
         self._step_shading(decay)
         error = dr.mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]), axis=None)
         return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
+                **{name: value[0] for name, value in terms.items()},
                 "psnr": -10 * float(np.log10(max(error.array[0], 1e-10)))}
 
     def finish(self) -> None:
@@ -95,22 +98,6 @@ class JointStage:
             self.light.log_radiance = self.shading["light"]
             self.light.update(self.parameters)
         self.parameters.update()
-
-    def _regularisation(self) -> mi.Float:
-        config, surface = self.config, self.subject.surface
-        faces = mi.Vector3u(surface.faces)
-        total = mi.Float(0)
-        for field in self.material.values().values():
-            channels = dr.width(field) // self.subject.lattice.vertex_count
-            values = surface.interpolate(field, channels)
-            total += config.material_smoothness * losses.edge_smoothness(values, faces)
-        if "weights" in self.subject.field_names:
-            spread = deviation(self.subject.surface, self.subject.lattice, self.subject.deform)
-            total += config.flexicubes_deviation * dr.mean(spread) / self.subject.lattice.spacing
-        if self.light:
-            texels = dr.unravel(mi.Color3f, self.light.radiance.array)
-            total += config.light_grey * losses.grey_world(texels)
-        return total
 
     def _step_geometry(self, decay: float, smoothing: float) -> None:
         optimizer, config = self.geometry, self.config
