@@ -64,6 +64,13 @@ def write_mesh(mesh: Any, positions: Any, faces: Any, normals: Any = None, **att
     return params.update()
 
 
+def drop_vertex_normals(mesh: Any) -> None:
+    """Leaves a mesh without vertex normals, so that it is shaded with those of its faces."""
+    params = mi.traverse(mesh)
+    params["vertex_normals"] = mi.Float([])
+    params.update()
+
+
 def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> mi.Mesh:
     """A mesh of (V, 3) positions and (F, 3) indices, shaded with face normals."""
     mesh = mi.Mesh(name, len(vertices), len(faces))

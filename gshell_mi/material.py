@@ -48,6 +48,28 @@ class MaterialField:
         return unit
 
 
+class GivenMaterial:
+    """One principled material everywhere that is not optimised: used like a ``MaterialField``.
+
+    Args:
+        count: lattice vertices.
+        base_color, roughness, metallic: as ``given_material`` found them; those of Mitsuba's ``principled``
+            where they are missing.
+    """
+
+    def __init__(self, count: int, *, base_color: np.ndarray | None = None, roughness: float = 0.5,
+                 metallic: float = 0.0):
+        color = np.broadcast_to(0.5 if base_color is None else base_color, (count, 3))
+        self.parameters: dict[str, mi.Float] = {}
+        self._values = {"vertex_color": mi.Float(color.astype(np.float32).ravel()),
+                        "vertex_roughness": dr.full(mi.Float, roughness, count),
+                        "vertex_metallic": dr.full(mi.Float, metallic, count)}
+
+    def values(self) -> dict[str, mi.Float]:
+        """The lattice fields by attribute name."""
+        return dict(self._values)
+
+
 def given_material(bsdf: mi.BSDF) -> dict:
     """Uniform values of a ``principled`` BSDF as arguments of ``MaterialField``; empty for other BSDFs."""
     parameters = mi.traverse(bsdf)

@@ -137,6 +137,11 @@ class GShell(mi.Mesh):
         self.weights = dr.zeros(mi.Float, self.lattice.weight_count) if weights is None else mi.Float(weights)
         self._extract()
 
+    def shade_flat(self) -> None:
+        """Shades with face normals from now on, as ``face_normals`` does from the start."""
+        if self.has_vertex_normals():
+            compat.drop_vertex_normals(self)
+
     def fields(self) -> LatticeFields:
         """A copy of the present fields on the host."""
         arrays = {name: np.array(dr.detach(getattr(self, name))) for name in self.field_names}
@@ -145,6 +150,12 @@ class GShell(mi.Mesh):
     def template(self) -> SurfaceMesh:
         """The watertight template of the present fields, in world space."""
         return self._in_world(extract(self.lattice, **self._fields(), template=True).template)
+
+    @property
+    def cell_size(self) -> float:
+        """Side of a cell in world units: the cube root of its volume."""
+        volume = abs(np.linalg.det(np.array(self.to_world.matrix)[:3, :3]))
+        return float(self.lattice.spacing * volume ** (1 / 3))
 
     @property
     def field_names(self) -> tuple[str, ...]:

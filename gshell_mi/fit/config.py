@@ -28,8 +28,17 @@ class FitConfig:
     """Cells per side of the lattice; default: that of the scene's gshell shape (64)."""
     checkpoint_seconds: float = 10.0
     """Seconds between checkpoints: what a kill loses at most."""
+
+    # --- modes: what is known already
     known_light: bool = False
     """Keep the scene's light as it is instead of optimising it."""
+    fixed_material: bool = False
+    """Keep the uniform principled material that the scene gives the gshell shape."""
+    geometry_only: bool = False
+    """Optimise nothing but the geometry, and from the images alone: light and material are those of the
+    scene, the mask loss of the joint stage is off, and shading normals are those of the faces."""
+    watertight: bool = False
+    """The object is closed: the mSDF stays positive and no openings are looked for."""
 
     # --- visual hull
     hull_daylight_votes: float = 0.15
@@ -142,6 +151,14 @@ class FitConfig:
     """Weight of the grey-world prior of the light."""
     flexicubes_deviation: float = 0.01
     """Weight of the FlexiCubes regulariser, in cells; only used with that grid."""
+
+    @property
+    def light_is_given(self) -> bool:
+        return self.known_light or self.geometry_only
+
+    @property
+    def material_is_given(self) -> bool:
+        return self.fixed_material or self.geometry_only
 
     def __post_init__(self):
         for name in ("ghost_iterations", "ghost_batch", "ghost_sheets", "spp", "primal_spp", "light_height"):

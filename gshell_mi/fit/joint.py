@@ -9,7 +9,7 @@ import numpy as np
 from .. import losses
 from ..fields.smoothing import LatticeDiffusion
 from ..light import EnvironmentLight
-from ..material import ATTRIBUTES, MaterialField, principled
+from ..material import GivenMaterial, MaterialField, principled
 from ..scene import FitScene
 from .config import FitConfig
 from .regularisers import Regularisers
@@ -19,10 +19,17 @@ class JointStage:
     """Adam on the lattice fields, the material and the environment map.
 
     The subject's shape holds the starting geometry. For the first part of the stage only material and
-    light move: geometry gradients mean nothing while the shading is wrong.
+    light move: geometry gradients mean nothing while the shading is wrong. If both are given, there is no
+    such part.
+
+    Args:
+        fit: the scene with its targets.
+        material: a ``GivenMaterial`` stays as it is.
+        light: None keeps the scene's.
+        config: settings of the stage.
     """
 
-    def __init__(self, fit: FitScene, material: MaterialField, light: EnvironmentLight | None,
+    def __init__(self, fit: FitScene, material: MaterialField | GivenMaterial, light: EnvironmentLight | None,
                  config: FitConfig):
         self.fit, self.material, self.light, self.config = fit, material, light, config
         self.subject = fit.subject
@@ -32,19 +39,24 @@ class JointStage:
         self.scene = optimised_scene(fit, light)
         self.parameters = mi.traverse(self.scene)
         self._targets = [mi.TensorXf(target.rgba) for target in fit.targets]
-        self._has_alpha = all(target.has_alpha for target in fit.targets)
+        self._sees_masks = all(target.has_alpha for target in fit.targets) and not config.geometry_only
+        if config.geometry_only:
+            self.subject.shade_flat()
         self._integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
                                          "reparam_depth": config.reparam_depth, "hide_emitters": True})
         self._diffuse = LatticeDiffusion(self.subject.lattice.stride)
         # One step size for the whole surface: normalising each vertex on its own would undo the smoothing
         # and let noise move the vertices that few pixels see as far as all others.
         self.geometry = mi.ad.Adam(lr=config.geometry_lr, uniform=True)
-        for name in self.subject.field_names:
+        self._moving = [name for name in self.subject.field_names
+                        if name != "msdf" or not config.watertight]
+        for name in self._moving:
             self.geometry[name] = mi.Float(self.parameters[f"subject.{name}"])
         self.shading = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
         if light:
             self.shading["light"] = light.log_radiance
-        self._regularisers = Regularisers(fit, self.scene, material, light, config)
+        self._regularisers = Regularisers(fit, self.scene, material if material.parameters else None, light,
+                                          config)
 
     @property
     def optimizers(self) -> dict[str, mi.ad.Adam]:
@@ -53,7 +65,7 @@ class JointStage:
     def step(self, iteration: int) -> dict[str, float]:
         """One step on one view; returns the losses."""
         config = self.config
-        moving = iteration >= config.warmup * config.iterations
+        moving = iteration >= config.warmup * config.iterations or not self.shading.state
         self._apply(geometry=moving)
         index = self._view(iteration)
         image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[index],
@@ -61,7 +73,7 @@ class JointStage:
                           seed=2 * iteration, seed_grad=2 * iteration + 1)
         target = self._targets[index]
         color = losses.IMAGE_LOSSES[config.image_loss](image[..., :3], target[..., :3])
-        mask = losses.mask_l2(image[..., 3], target[..., 3]) if self._has_alpha else mi.Float(0)
+        mask = losses.mask_l2(image[..., 3], target[..., 3]) if self._sees_masks else mi.Float(0)
         regularisation, terms = self._regularisers(index)
         total = color + config.joint_mask * mask + regularisation
         dr.backward(total)
@@ -89,9 +101,9 @@ class JointStage:
     def _apply(self, *, geometry: bool) -> None:
         """Puts the optimisers' parameters into the scene, attached."""
         if geometry:
-            for name in self.subject.field_names:
+            for name in self._moving:
                 self.parameters[f"subject.{name}"] = self.geometry[name]
-        self.material.parameters = {name: self.shading[name] for name in ATTRIBUTES}
+        self.material.parameters = {name: self.shading[name] for name in self.material.parameters}
         for name, field in self.material.values().items():
             self.parameters[f"subject.lattice_{name}"] = field
         if self.light:
@@ -102,7 +114,7 @@ class JointStage:
     def _step_geometry(self, decay: float, smoothing: float) -> None:
         optimizer, config = self.geometry, self.config
         cell = self.subject.lattice.spacing
-        for name in self.subject.field_names:
+        for name in self._moving:
             gradient = dr.grad(optimizer[name])
             gradient = dr.select(dr.isfinite(gradient), gradient, 0)
             # The weights of FlexiCubes belong to cubes, one by one.
@@ -112,16 +124,18 @@ class JointStage:
         rate = decay * config.geometry_lr * cell
         local = decay * config.deform_lr
         rates = {"sdf": rate, "msdf": rate, "deform": local, "weights": local}
-        optimizer.set_learning_rate({name: rates[name] for name in self.subject.field_names})
+        optimizer.set_learning_rate({name: rates[name] for name in self._moving})
         optimizer.step()
         optimizer["deform"] = dr.minimum(dr.maximum(optimizer["deform"], -1), 1)
 
     def _step_shading(self, decay: float) -> None:
         config, optimizer = self.config, self.shading
-        for name in ATTRIBUTES:
+        if not optimizer.state:
+            return
+        for name in self.material.parameters:
             gradient = dr.grad(optimizer[name])
             dr.set_grad(optimizer[name], self._diffuse(gradient, config.material_gradient_smoothing))
-        rates = dict.fromkeys(ATTRIBUTES, decay * config.material_lr)
+        rates = dict.fromkeys(self.material.parameters, decay * config.material_lr)
         if self.light:
             rates["light"] = decay * config.light_lr
         optimizer.set_learning_rate(rates)

@@ -23,8 +23,6 @@ from ..fields import LatticeFields
 from ..fields.moved_template import advect
 from ..fields.visual_hull import visual_hull
 from ..lattice import make_lattice
-from ..light import EnvironmentLight
-from ..material import MaterialField, given_material
 from ..report import write_report
 from ..scene import load_fit_scene
 from ..topology import topology
@@ -39,9 +37,7 @@ from .pixels import PixelPool
 from .progress import Progress
 from .radiance_ghost import RadianceGhost
 from .refinement import PhotometricRefinement
-
-#: Median reflectance that the first split of radiance into material and light assumes.
-_TYPICAL_REFLECTANCE = 0.5
+from .start import TYPICAL_REFLECTANCE, check_given, start_fields, start_light, start_material
 
 #: What the joint stage starts from.
 _SURFACE = ("sdf", "msdf", "radiance", "known")
@@ -110,6 +106,7 @@ class _Fit:
             self.scene = load_fit_scene(scene, Path(targets) if targets else None,
                                         on_reference=progress.reference)
             self.views = PinholeViews.from_sensors(self.scene.sensors)
+            check_given(self.scene, config)
         if not all(target.has_alpha for target in self.scene.targets):
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
         given = self.scene.subject.lattice
@@ -162,14 +159,14 @@ class _Fit:
     def _start_from_file(self) -> None:
         """Starts from the fields that the scene's gshell shape was given, openings included."""
         fields = self.scene.subject.fields().to_lattice(self.lattice.resolution)
-        if (fields.msdf > 0).all():
+        if self.config.watertight or (fields.msdf > 0).all():
             self._enter("ghost", sdf=fields.sdf)
             return
         count = self.lattice.vertex_count
         brightness = self.pixels.mean_radiance()
         self._enter("joint", sdf=fields.sdf, msdf=fields.msdf, deform=fields.deform,
                     radiance=np.zeros((count, 3), np.float32), known=np.zeros(count, bool),
-                    light=np.float32(brightness / _TYPICAL_REFLECTANCE))
+                    light=np.float32(brightness / TYPICAL_REFLECTANCE))
 
     def _closed_at_border(self, sdf: np.ndarray) -> np.ndarray:
         """Outside at the cube's faces, so that the template is watertight; finite everywhere."""
@@ -181,17 +178,17 @@ class _Fit:
         return grid.ravel()
 
     def _ghost(self) -> None:
-        """Finds the openings of the template."""
+        """Finds the openings of the template, and its radiance."""
         state = self.checkpoint.arrays
         template, vertices, faces = self._template(state["sdf"])
         ghost = RadianceGhost(vertices, faces, self.views, self.pixels, self.config)
-        self._iterate("ghost", self.config.ghost_iterations, ghost.step, {"ghost": ghost.optimizer},
-                      {"sdf": state["sdf"]})
-        clean = partial(clean_opacity, vertices=vertices, faces=faces, min_area=self.config.ghost_min_area)
+        if not self.config.watertight:
+            self._iterate("ghost", self.config.ghost_iterations, ghost.step, {"ghost": ghost.optimizer},
+                          {"sdf": state["sdf"]})
         with self.progress.stage("openings", None), self._timed("ghost"):
-            logits = close_unjustified(clean(ghost.smoothed_logits()), faces, ghost.image_error,
-                                       self.config.ghost_gain)
-            logits = clean(logits)
+            logits = np.ones(len(vertices))
+            if not self.config.watertight:
+                logits = self._openings(ghost, vertices, faces)
             opened = logits <= 0
             ghost.refit(~opened)
         if opened.all():
@@ -203,7 +200,13 @@ class _Fit:
         light = float(np.median(front[~opened].mean(axis=1)))
         radiance = radiance.numpy().reshape(-1, 3)
         self._enter("refinement", sdf=state["sdf"], msdf=msdf.numpy(), radiance=radiance, known=known.numpy(),
-                    light=np.float32(light / _TYPICAL_REFLECTANCE))
+                    light=np.float32(light / TYPICAL_REFLECTANCE))
+
+    def _openings(self, ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """(V,) opacity logits of a fitted ghost, negative where the images justify an opening."""
+        clean = partial(clean_opacity, vertices=vertices, faces=faces, min_area=self.config.ghost_min_area)
+        return clean(close_unjustified(clean(ghost.smoothed_logits()), faces, ghost.image_error,
+                                       self.config.ghost_gain))
 
     def _refine(self) -> None:
         """Moves the template inside the hull, and the fields with it."""
@@ -284,17 +287,9 @@ class _Fit:
 
     def _joint(self) -> JointStage:
         start = dict(self.checkpoint.arrays)
-        deform = start.get("deform", np.zeros(3 * start["sdf"].size, np.float32))
-        fields = LatticeFields(start["sdf"], start["msdf"], deform, grid=self.lattice.grid)
-        self.scene.subject.set_fields(fields)
-        light = None
-        if not self.config.known_light:
-            light = (EnvironmentLight.from_emitter(self.scene.light, self.config.light_height)
-                     or EnvironmentLight.uniform(self.config.light_height, float(start["light"])))
-        reflectance = np.where(start["known"][:, None], start["radiance"] / start["light"],
-                               _TYPICAL_REFLECTANCE)
-        material = MaterialField(reflectance, **given_material(self.scene.bsdf))
-        joint = JointStage(self.scene, material, light, self.config)
+        self.scene.subject.set_fields(start_fields(start, self.lattice.grid))
+        joint = JointStage(self.scene, start_material(self.scene, start, self.config),
+                           start_light(self.scene, start, self.config), self.config)
         if self.checkpoint.stage == "joint":
             self._iterate("joint", self.config.iterations, joint.step, joint.optimizers, start)
         else:

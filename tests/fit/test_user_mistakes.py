@@ -181,10 +181,16 @@ def test_unknown_variant(told):
 
 @pytest.mark.parametrize(("option", "value"), [
     ("--spp", "0"), ("--ghost-batch", "0"), ("--iterations", "-1"), ("--max-depth", "1"), ("--warmup", "1.5"),
-    ("--resolution", "0"), ("--checkpoint-seconds", "-1"),
+    ("--resolution", "0"), ("--checkpoint-seconds", "-1"), ("--eikonal", "-1"), ("--light-grey", "-0.1"),
 ])
 def test_setting_out_of_range(told, option, value):
     assert option.strip("-").replace("-", " ").split()[-1] in told(option, value)
+
+
+@pytest.mark.parametrize("mode", ["--fixed-material", "--geometry-only"])
+def test_no_material_to_keep(told, scene, mode):
+    sentence = f"{mode} keeps the material of the gshell shape, but '{scene}' gives it no uniform one"
+    assert sentence in told(mode)
 
 
 def test_nothing_opaque(told, monkeypatch):
