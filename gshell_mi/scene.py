@@ -45,12 +45,14 @@ class FitScene:
 
 
 def load_fit_scene(path: Path, targets: Path | None = None, *,
+                   before_targets: Callable[[mi.Shape, list[mi.Sensor]], None] | None = None,
                    on_reference: Callable[[int, int], None] | None = None) -> FitScene:
     """Loads and checks a fit scene with its targets.
 
     Args:
         path: the XML file.
         targets: folder of ``<sensor id>.exr``; default: the folder beside the XML with its stem.
+        before_targets: called with the gshell shape and the sensors before any target is rendered or read.
         on_reference: called with (views done, views) while missing targets are rendered from
             ``reference.xml``.
 
@@ -71,6 +73,8 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
     if repeated:
         raise UserError(f"Scene '{path}' has several sensors with the id '{repeated[0]}'; "
                         f"rename all but one.")
+    if before_targets:
+        before_targets(subject, sensors)
     folder = Path(targets) if targets else path.with_suffix("")
     if targets is None:
         _render_missing_targets(path, folder, sensors, on_reference)

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import compat
+from . import compat, memory
 from .errors import UserError
 from .extraction import SurfaceMesh, extract
 from .extraction.surface_mesh import gather
@@ -16,6 +16,11 @@ from .lattice import make_lattice
 
 _FIELDS = ("sdf", "msdf", "deform", "weights")
 _LATTICE_PREFIX = "lattice_"
+
+#: Bytes per lattice vertex that constructing a shape takes, measured with 128 and 256 cells per side.
+_BYTES_PER_VERTEX = 32
+#: Cells per side; smaller lattices fit anywhere.
+_LARGE = 200
 
 
 class GShell(mi.Mesh):
@@ -222,6 +227,9 @@ class _Padding:
 
 def _initial_fields(filename: str, grid: str, resolution: int | None, to_world: Any) -> LatticeFields:
     lattice = make_lattice(grid, 64 if resolution is None else resolution)
+    if lattice.resolution > _LARGE:
+        memory.require(_BYTES_PER_VERTEX * lattice.vertex_count, memory.free_memory_of_variant(),
+                       f"A lattice of {lattice.resolution} cells per side", "lower its resolution")
     if not filename:
         return sphere(lattice)
     path = mi.file_resolver().resolve(filename)

@@ -70,7 +70,7 @@ def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
     fine = FittedMesh(fine.vertices @ turn.T, fine.faces, fine.normals @ turn.T, fine.attributes)
     vertices, faces = _simplified(fine, config.face_count)
     atlas = unwrap(vertices, faces, texture_size=config.texture_size, seconds=config.unwrap_seconds)
-    normals = _normals(vertices, faces)
+    normals = vertex_normals(vertices, faces)
     report = {"faces": len(faces), "charts": atlas.charts if atlas else 0}
     if atlas:
         vertices, normals, faces = vertices[atlas.source], normals[atlas.source], atlas.faces
@@ -122,7 +122,7 @@ def _simplified(fine: FittedMesh, face_count: int) -> tuple[np.ndarray, np.ndarr
 def _write_remeshed(folder: Path, fine: FittedMesh, config: AssetConfig) -> dict:
     vertices, faces = remesh(fine.vertices, fine.faces, config.remesh, resample_boundary=True,
                              min_quality=config.min_quality)
-    normals = _normals(vertices, faces)
+    normals = vertex_normals(vertices, faces)
     source = project(fine, vertices, normals)
     attributes = {name: source.interpolate(fine.faces, values) for name, values in fine.attributes.items()}
     write_ply(folder / "remeshed.ply", vertices, faces, normals, attributes)
@@ -153,7 +153,8 @@ def _write_obj(folder: Path, vertices: np.ndarray, normals: np.ndarray, faces: n
     (folder / "mesh.obj").write_text("\n".join(lines) + "\n")
 
 
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V, 3) unit normals; any direction where a vertex has no area."""
     normals = np.array(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
     normals[np.abs((normals ** 2).sum(1) - 1) > 1e-3] = [0, 1, 0]  # of vertices without area
     return normals

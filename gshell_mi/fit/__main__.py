@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -32,6 +33,10 @@ class _Arguments:
     """Leave out mesh.glb and report.html, which take some seconds."""
     quiet: bool = False
     """No progress bars."""
+    viewer: bool = False
+    """Show the fit in the browser while it runs; needs the extra: pip install gshell_mi[viewer]."""
+    viewer_port: int = 8080
+    """Port of --viewer; if it is taken, the next one that is free."""
     config: Annotated[FitConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FitConfig)
 
 
@@ -43,11 +48,17 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _fit(given: _Arguments) -> None:
     # Only now, as plugins and types exist per variant.
+    from ..viewer import Viewer
     from .run import fit_scene
 
-    result = fit_scene(given.scene, given.output, targets=given.targets, config=given.config,
-                       resume=given.resume, overwrite=given.overwrite, report=not given.no_report,
-                       quiet=given.quiet)
+    with ExitStack() as stack:
+        viewer = None
+        if given.viewer:
+            viewer = stack.enter_context(Viewer(given.viewer_port))
+            print(f"live view: {viewer.url}", file=sys.stderr)
+        result = fit_scene(given.scene, given.output, targets=given.targets, config=given.config,
+                           resume=given.resume, overwrite=given.overwrite, report=not given.no_report,
+                           quiet=given.quiet, observer=viewer)
     counts = result.metrics["counts"]
     print(f"{result.output}: {counts['vertices']} vertices, {counts['faces']} faces, "
           f"{counts['boundary_loops']} boundary loops, {counts['components']} components, "

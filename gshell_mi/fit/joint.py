@@ -12,6 +12,7 @@ from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, principled
 from ..scene import FitScene
 from .config import FitConfig
+from .observer import Preview
 from .regularisers import Regularisers
 
 
@@ -91,6 +92,15 @@ class JointStage:
     def finish(self) -> None:
         """Leaves the last step's parameters in the scene."""
         self._apply(geometry=True)
+
+    def preview(self) -> Preview:
+        """The mesh of the last step in its base colour."""
+        surface = self.subject.surface
+        with dr.suspend_grad():
+            colors = surface.interpolate(self.material.values()["vertex_color"], 3).numpy().T
+            template_vertices, template_faces, _ = self.subject.template().to_numpy()
+        vertices, faces, _ = surface.to_numpy()
+        return Preview(vertices, faces, colors, template_vertices, template_faces)
 
     def _view(self, iteration: int) -> int:
         """Every view once per round, in an order that depends on seed and round alone."""

@@ -35,8 +35,12 @@ class Progress:
     def __exit__(self, *_) -> None:
         self._bars.stop()
 
-    def warn(self, message: str) -> None:
+    def tell(self, message: str) -> None:
         """One line above the bars."""
+        self._console.print(message)
+
+    def warn(self, message: str) -> None:
+        """The same for what may be wrong."""
         self._console.print(f"[yellow]warning:[/] {message}")
 
     @contextmanager

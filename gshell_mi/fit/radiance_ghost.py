@@ -17,6 +17,7 @@ from .. import losses
 from ..fields.smoothing import MeshDiffusion
 from ..views import PinholeViews
 from .config import FitConfig
+from .observer import Preview
 from .pixels import PixelPool, PixelSample
 
 #: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
@@ -178,6 +179,12 @@ class RadianceGhost:
     def radiance(self) -> tuple[np.ndarray, np.ndarray]:
         """(V, 3) front and back radiance."""
         return tuple(_softplus(self.optimizer[side]).numpy().reshape(-1, 3) for side in ("front", "back"))
+
+    def preview(self) -> Preview:
+        """The part of the mesh that is not clearly fading, in the radiance of its front."""
+        vertices, faces = self._positions.numpy().reshape(-1, 3), self._faces.numpy().reshape(-1, 3)
+        kept = dr.detach(self.optimizer["opacity"]).numpy() > 2 * _INITIAL_LOGIT
+        return Preview(vertices, faces[kept[faces].all(axis=1)], self.radiance()[0], vertices, faces)
 
     def _sheets(self, ray: mi.Ray3f) -> list[tuple]:
         """The first sheets along each ray: (hit?, vertex indices, barycentric weights, front side?)."""

@@ -16,6 +16,7 @@ import numpy as np
 from .. import losses
 from ..fields.smoothing import MeshDiffusion
 from .config import FitConfig
+from .observer import Preview
 from .outlines import Outlines
 from .radiance_ghost import SIDES, RadianceGhost
 
@@ -74,6 +75,10 @@ class PhotometricRefinement:
     def positions(self) -> np.ndarray:
         """(V, 3) world positions."""
         return self.optimizer["positions"].numpy().reshape(-1, 3)
+
+    def preview(self) -> Preview:
+        """The ghost's, where it is now."""
+        return self.ghost.preview()
 
     def _move(self, progress: float, iteration: int) -> None:
         config, optimizer = self.config, self.optimizer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +23,7 @@ from ..fields import LatticeFields
 from ..fields.moved_template import advect
 from ..fields.visual_hull import visual_hull
 from ..lattice import make_lattice
+from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
 from ..scene import load_fit_scene
 from ..topology import topology
@@ -31,6 +32,8 @@ from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
 from .config import FitConfig, default_output
 from .interrupt import Interrupt
 from .joint import JointStage
+from .memory import MemoryEstimate
+from .observer import Observer
 from .opening import clean_opacity, close_unjustified, msdf_from_template, splat_to_lattice
 from .outlines import Outlines
 from .pixels import PixelPool
@@ -66,7 +69,7 @@ class FitResult:
 
 def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: str | Path | None = None,
               config: FitConfig | None = None, resume: bool = False, overwrite: bool = False,
-              report: bool = True, quiet: bool = True) -> FitResult:
+              report: bool = True, quiet: bool = True, observer: Observer | None = None) -> FitResult:
     """Reconstructs the gshell shape of a fit scene, its material and its light.
 
     A Mitsuba ``llvm`` or ``cuda`` variant must be set.
@@ -80,6 +83,7 @@ def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: s
         overwrite: replace an earlier fit in ``output``.
         report: also write ``mesh.glb`` and ``report.html``.
         quiet: no progress bar.
+        observer: is told of every step, such as ``viewer.Viewer``.
 
     Raises:
         UserError: of anything that the user can mend.
@@ -88,13 +92,15 @@ def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: s
     scene = Path(scene)
     output = Path(output) if output else default_output(scene)
     with Interrupt() as interrupt, Progress(quiet=quiet) as progress:
-        return _Fit(scene, output, targets, config, resume, overwrite, report, progress, interrupt).run()
+        return _Fit(scene, output, targets, config, resume, overwrite, report, progress, interrupt,
+                    observer).run()
 
 
 class _Fit:
     def __init__(self, scene: Path, output: Path, targets: str | Path | None, config: FitConfig, resume: bool,
-                 overwrite: bool, report: bool, progress: Progress, interrupt: Interrupt):
-        self.config, self.output, self.report = config, output, report
+                 overwrite: bool, report: bool, progress: Progress, interrupt: Interrupt,
+                 observer: Observer | None):
+        self.config, self.output, self.report, self.observer = config, output, report, observer
         self.progress, self.interrupt = progress, interrupt
         self.path = output / "checkpoint.npz"
         self.checkpoint = Checkpoint("hull", 0, _plain(config))
@@ -104,7 +110,7 @@ class _Fit:
         check_output_folder(output, keep=resume, overwrite=overwrite)
         with progress.stage("targets", None):
             self.scene = load_fit_scene(scene, Path(targets) if targets else None,
-                                        on_reference=progress.reference)
+                                        before_targets=self._check_memory, on_reference=progress.reference)
             self.views = PinholeViews.from_sensors(self.scene.sensors)
             check_given(self.scene, config)
         if not all(target.has_alpha for target in self.scene.targets):
@@ -114,6 +120,8 @@ class _Fit:
         self.pixels = PixelPool(self.views, self.scene.targets)
         # Nothing of an earlier fit goes before all is known to be in order.
         make_output_folder(output, keep=resume)
+        if observer:
+            observer.begin(self.scene)
 
     def run(self) -> FitResult:
         try:
@@ -128,15 +136,25 @@ class _Fit:
             self.interrupt.check()
             with self.progress.stage("export", None), self._timed("export"):
                 metrics = export_fit(self.output, self.scene, joint, self.config)
-            metrics = write_metrics(self.output, metrics, self.checkpoint.seconds)
+            metrics = self._write_metrics(metrics)
             if self.report:
                 self._write_documents()
-                metrics = write_metrics(self.output, metrics, self.checkpoint.seconds)
+                metrics = self._write_metrics(metrics)
         except OSError as error:
             raise UserError(f"'{error.filename or self.output}' cannot be written "
                             f"({error.strerror or error}); free some space or mend its permissions, then "
                             f"continue with --resume.") from error
         return FitResult(self.output, metrics)
+
+    def _check_memory(self, subject: mi.Shape, sensors: list[mi.Sensor]) -> None:
+        """Says how much memory the fit needs, and refuses it if that much is not free."""
+        sizes = np.array([sensor.film().crop_size() for sensor in sensors])
+        resolution = self.config.resolution or subject.lattice.resolution
+        self.memory = MemoryEstimate.of(self.config, resolution, sizes, report=self.report)
+        free = free_memory_of_variant()
+        told = "" if free is None else f"; {free / GIB:.1f} GiB are free"
+        self.progress.tell(f"memory: about {self.memory.total / GIB:.1f} GiB{told}")
+        self.memory.require(free)
 
     # --- stages
 
@@ -183,7 +201,7 @@ class _Fit:
         template, vertices, faces = self._template(state["sdf"])
         ghost = RadianceGhost(vertices, faces, self.views, self.pixels, self.config)
         if not self.config.watertight:
-            self._iterate("ghost", self.config.ghost_iterations, ghost.step, {"ghost": ghost.optimizer},
+            self._iterate("ghost", self.config.ghost_iterations, ghost, {"ghost": ghost.optimizer},
                           {"sdf": state["sdf"]})
         with self.progress.stage("openings", None), self._timed("ghost"):
             logits = np.ones(len(vertices))
@@ -226,7 +244,7 @@ class _Fit:
             outlines = Outlines(self.views, alphas, faces, solid)
         cell = self.lattice.spacing * _length_scale(self.scene.subject.to_world)
         refinement = PhotometricRefinement(ghost, vertices, faces, outlines, cell, self.config)
-        self._iterate("refinement", self.config.refinement_iterations, refinement.step,
+        self._iterate("refinement", self.config.refinement_iterations, refinement,
                       {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
         with self._timed("refinement"):
             ghost.move(mi.Float(refinement.positions().ravel()))
@@ -291,7 +309,7 @@ class _Fit:
         joint = JointStage(self.scene, start_material(self.scene, start, self.config),
                            start_light(self.scene, start, self.config), self.config)
         if self.checkpoint.stage == "joint":
-            self._iterate("joint", self.config.iterations, joint.step, joint.optimizers, start)
+            self._iterate("joint", self.config.iterations, joint, joint.optimizers, start)
         else:
             for name, optimizer in joint.optimizers.items():
                 restore_optimizer(name, optimizer, self.checkpoint.arrays)
@@ -300,6 +318,11 @@ class _Fit:
             self.checkpoint.stage = "done"
             self.checkpoint.save(self.path)
         return joint
+
+    def _write_metrics(self, metrics: dict) -> dict:
+        mib = {"estimated_memory_mib": self.memory.total, "peak_memory_mib": peak_memory()}
+        metrics = metrics | {name: round(size / 2**20) for name, size in mib.items()}
+        return write_metrics(self.output, metrics, self.checkpoint.seconds)
 
     def _write_documents(self) -> None:
         """The asset and the report; for want of them a fit is not lost."""
@@ -313,7 +336,7 @@ class _Fit:
 
     # --- bookkeeping
 
-    def _iterate(self, stage: str, count: int, step: Callable[[int], dict[str, float]],
+    def _iterate(self, stage: str, count: int, worker: RadianceGhost | PhotometricRefinement | JointStage,
                  optimizers: Mapping[str, mi.ad.Adam], constants: dict[str, np.ndarray]) -> None:
         """Runs the steps of a stage that are left, logging each and saving a checkpoint now and then."""
         first = self.checkpoint.iteration
@@ -334,10 +357,12 @@ class _Fit:
             for iteration in range(first, count):
                 begin = time.monotonic()
                 self.interrupt.check()
-                values = step(iteration)
+                values = worker.step(iteration)
                 values = {name: float(value) for name, value in values.items()}
                 self._write_log(stage, iteration, values, time.monotonic() - begin)
                 advance(values)
+                if self.observer:
+                    self.observer.step(stage, iteration, count, values, worker.preview)
                 self._spent(stage, time.monotonic() - begin)
                 if time.monotonic() - saved > self.config.checkpoint_seconds:
                     save(iteration + 1)

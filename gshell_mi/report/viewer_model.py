@@ -26,13 +26,8 @@ def viewer_model(folder: Path) -> bytes:
     subject = read_part(base)
     turn = y_up_turn(folder)
     mesh, template = read_ply(folder / "mesh.ply"), read_ply(folder / "template.ply")
-    # A hair behind, or the two sides of one sheet would flicker.
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
-    positions, normals = subject.attributes["POSITION"], subject.attributes["NORMAL"]
-    parts = [Part("back faces", subject.indices[:, ::-1],
-                  {"POSITION": positions - 3e-4 * diagonal * normals, "NORMAL": -normals},
-                  {"pbrMetallicRoughness": {"baseColorFactor": [*ORANGE, 1], "metallicFactor": 0,
-                                            "roughnessFactor": 0.8}, "alphaMode": "MASK"})]
+    parts = [back_faces(subject.attributes["POSITION"], subject.attributes["NORMAL"], subject.indices)]
     if len(template.faces):
         parts.append(Part("template", template.faces,
                           {"POSITION": template.vertices @ turn.T, "NORMAL": template.normals @ turn.T},
@@ -46,6 +41,15 @@ def viewer_model(folder: Path) -> bytes:
                                                     "roughnessFactor": 1}, "emissiveFactor": [0.5, 0, 0.2],
                            "alphaMode": "MASK", "doubleSided": True}))
     return glb_bytes(parts, base)
+
+
+def back_faces(positions: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> Part:
+    """The other side of a sheet in orange, as the paper shows it."""
+    # A hair behind, or the two sides would flicker.
+    offset = 3e-4 * np.linalg.norm(np.ptp(positions, axis=0))
+    return Part("back faces", faces[:, ::-1], {"POSITION": positions - offset * normals, "NORMAL": -normals},
+                {"pbrMetallicRoughness": {"baseColorFactor": [*ORANGE, 1], "metallicFactor": 0,
+                                          "roughnessFactor": 0.8}, "alphaMode": "MASK"})
 
 
 def boundary_tubes(vertices: np.ndarray, faces: np.ndarray,

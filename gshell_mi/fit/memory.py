@@ -1,0 +1,77 @@
+"""How much memory a fit will take, said before it starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import memory
+from .config import FitConfig
+
+# Bytes, measured on llvm_ad_rgb: peak resident memory of short fits (all stages, a few steps each) with 32 to
+# 128 cells, 12 to 100 views and 128 to 800 pixels per side. pipelines/calibrate_memory.py repeats it.
+_PROGRAM = 280 * 2**20  # Python, Mitsuba, LLVM and its kernels
+_ASSET = 350 * 2**20  # baking the textures of mesh.glb
+_PER_PIXEL = 44  # of all targets: NumPy's copy, the pools of the ghost and of the refinement, the joint stage
+_PER_VERTEX = 490  # of the lattice: fields and material, their Adam moments and gradients
+_PER_VOTE = 4  # and lattice vertex: what the visual hull keeps per view that has to see daylight
+_PER_SQUARE_CELL = 37_000  # resolution squared, as the surface grows: meshes, edge lists, derivatives
+_PER_SAMPLE = 100  # of a rendered image
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """Peak memory of a fit in bytes, by what takes it.
+
+    Attributes:
+        program: what every fit takes, whatever its size.
+        lattice: fields and the surface in them.
+        targets: the images.
+        samples: one rendered view.
+    """
+
+    program: int
+    lattice: int
+    targets: int
+    samples: int
+
+    @classmethod
+    def of(cls, config: FitConfig, resolution: int, sizes: np.ndarray, *,
+           report: bool = True) -> MemoryEstimate:
+        """Estimates it.
+
+        Args:
+            config: the settings.
+            resolution: cells per side of the lattice.
+            sizes: (N, 2) width and height of the views in pixels.
+            report: whether mesh.glb and report.html are written.
+
+        >>> few, many = (MemoryEstimate.of(FitConfig(), 64, np.full((n, 2), 256)) for n in (24, 48))
+        >>> many.total - few.total == many.targets - few.targets > 0
+        True
+        """
+        pixels = np.asarray(sizes, np.int64).prod(axis=1)
+        votes = config.hull_daylight_votes * len(pixels)
+        return cls(
+            program=_PROGRAM + (_ASSET if report else 0),
+            lattice=int((_PER_VERTEX + _PER_VOTE * votes) * (resolution + 1) ** 3
+                        + _PER_SQUARE_CELL * resolution**2),
+            targets=_PER_PIXEL * int(pixels.sum()),
+            samples=_PER_SAMPLE * int(pixels.max()) * max(config.primal_spp, config.spp))
+
+    @property
+    def total(self) -> int:
+        return self.program + self.lattice + self.targets + self.samples
+
+    def require(self, free: int | None) -> None:
+        """Refuses, by a ``UserError`` that says what to lower, a fit that needs more than ``free`` bytes."""
+        cures = {
+            "program": "close other programs",
+            "lattice": "lower --resolution",
+            "targets": "use fewer or smaller views (--max-size of the import)",
+            "samples": "lower --primal-spp and --spp, or use smaller views (--max-size of the import)",
+        }
+        largest = max(cures, key=lambda name: getattr(self, name))
+        share = getattr(self, largest) / memory.GIB
+        memory.require(self.total, free, "The fit", f"{cures[largest]}, which makes up {share:.1f} GiB")
