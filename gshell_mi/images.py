@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from .files import replacing
+
 
 def srgb(linear: np.ndarray) -> np.ndarray:
     """Linear Rec.709 to sRGB (IEC 61966-2-1), clipped to [0, 1].
@@ -41,4 +43,5 @@ def triptych(target: np.ndarray, fit: np.ndarray) -> np.ndarray:
 
 def write_png(path: Path, image: np.ndarray) -> None:
     """Writes (h, w, 3) sRGB values in [0, 1]."""
-    Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)).save(path)
+    with replacing(path) as partial:
+        Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)).save(partial)

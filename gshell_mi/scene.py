@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from .errors import UserError
+from .files import replacing
 from .targets import Target, load_target
 
 #: Samples per pixel of targets rendered from a scene's reference.
@@ -136,14 +136,12 @@ def _render_missing_targets(path: Path, folder: Path, sensors: list[mi.Sensor],
             progress(index, len(missing))
         image = mi.render(scene, sensor=sensor, integrator=integrator, spp=REFERENCE_SPP, seed=index)
         target = folder / f"{sensor.id()}.exr"
-        # A killed run must not leave half an image behind that the next run takes for a target.
-        partial = target.with_name(f".{target.name}")
         bitmap = mi.Bitmap(image, mi.Bitmap.PixelFormat.RGBA)
         try:
-            bitmap.convert(component_format=mi.Struct.Type.Float16).write(str(partial))
-            os.replace(partial, target)
+            # A killed run must not leave half an image behind that the next run takes for a target.
+            with replacing(target) as partial:
+                bitmap.convert(component_format=mi.Struct.Type.Float16).write(str(partial))
         except (OSError, RuntimeError) as error:
-            partial.unlink(missing_ok=True)
             raise UserError(f"Target '{target}' cannot be written ({error}); make the folder writable, "
                             f"or name another with --targets.") from error
     if progress:

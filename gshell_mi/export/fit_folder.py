@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 import numpy as np
 
+from ..files import replacing
 from ..images import over_white, psnr, triptych, write_png
 from ..topology import topology
 from .ply import write_ply
@@ -39,7 +39,7 @@ def export_fit(output: Path, fit: FitScene, joint: JointStage, config: FitConfig
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
     write_light(output / "light.exr", fit.light, joint.light)
     write_scene(output / "scene.xml", fit.light, fit.sensors)
-    scores = _write_views(output, fit)
+    scores = _write_views(output, fit, config.triptychs)
     vertices, faces, _ = surface.to_numpy()
     return {
         "scene": fit.path.name,
@@ -56,9 +56,8 @@ def export_fit(output: Path, fit: FitScene, joint: JointStage, config: FitConfig
 def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dict:
     """Writes ``metrics.json`` in one step, with the seconds per stage and their sum; returns its contents."""
     metrics = metrics | {"seconds": {**seconds, "total": round(sum(seconds.values()), 3)}}
-    partial = output / ".metrics.json.partial"
-    partial.write_text(json.dumps(metrics, indent=1))
-    os.replace(partial, output / "metrics.json")
+    with replacing(output / "metrics.json") as partial:
+        partial.write_text(json.dumps(metrics, indent=1))
     return metrics
 
 
@@ -68,14 +67,15 @@ def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.nd
     write_ply(path, vertices, faces, normals, attributes)
 
 
-def _write_views(output: Path, fit: FitScene) -> dict[str, float]:
-    """Renders the exported scene from the training views; writes triptychs, returns PSNR by view id."""
+def _write_views(output: Path, fit: FitScene, count: int) -> dict[str, float]:
+    """Renders the exported scene from ``count`` training views; writes triptychs, returns PSNR by view id."""
     folder = output / "views"
     folder.mkdir(exist_ok=True)
     scene = mi.load_file(str(output / "scene.xml"))
     integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
     scores = {}
-    for sensor, target in zip(fit.sensors, fit.targets, strict=True):
+    for index in np.unique(np.linspace(0, len(fit.sensors) - 1, count).round().astype(int)):
+        sensor, target = fit.sensors[index], fit.targets[index]
         image = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=_EXPORT_SPP))
         scores[sensor.id()] = psnr(over_white(image), over_white(target.rgba))
         write_png(folder / f"{sensor.id()}.png", triptych(target.rgba, image))

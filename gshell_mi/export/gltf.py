@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from .. import __version__
+from ..files import replacing
 
 _FLOAT, _UINT = 5126, 5125
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
@@ -46,7 +47,8 @@ class Part:
 
 def write_glb(path: Path, parts: list[Part]) -> None:
     """Writes the parts into one scene."""
-    path.write_bytes(glb_bytes(parts))
+    with replacing(path) as partial:
+        partial.write_bytes(glb_bytes(parts))
 
 
 def glb_bytes(parts: list[Part], base: bytes | None = None) -> bytes:

@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from ..errors import UserError
+from ..files import replacing
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, normals: np.n
         table[:, index] = column
     rows = np.empty(len(faces), np.dtype([("count", "u1"), ("indices", "<i4", 3)]))
     rows["count"], rows["indices"] = 3, faces
-    path.write_bytes(header.encode() + table.tobytes() + rows.tobytes())
+    with replacing(path) as partial:
+        partial.write_bytes(header.encode() + table.tobytes() + rows.tobytes())
 
 
 def read_ply(path: Path) -> FittedMesh:

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..compat import environment_radiance
+from ..files import replacing
 from ..material import ATTRIBUTES
 
 if TYPE_CHECKING:
@@ -73,7 +74,8 @@ def write_light(path: Path, given: mi.Emitter, optimised: EnvironmentLight | Non
         else:
             radiance = np.array(parameters["radiance.value"], np.float32).ravel()
             bitmap = mi.Bitmap(np.broadcast_to(radiance, (8, 16, 3)).astype(np.float32))
-    bitmap.write(str(path))
+    with replacing(path) as partial:
+        bitmap.write(str(partial))
 
 
 def write_scene(path: Path, light: mi.Emitter, sensors: list[mi.Sensor]) -> None:
@@ -92,8 +94,10 @@ def write_scene(path: Path, light: mi.Emitter, sensors: list[mi.Sensor]) -> None
     if "to_world" in parameters:
         light_to_world = (f'\n        <transform name="to_world">'
                           f'<matrix value="{_matrix(parameters["to_world"].matrix)}"/></transform>')
-    path.write_text(_SCENE.format(depth=MAX_DEPTH, textures=textures, light_to_world=light_to_world,
-                                  sensors="\n".join(_sensor(sensor) for sensor in sensors)))
+    text = _SCENE.format(depth=MAX_DEPTH, textures=textures, light_to_world=light_to_world,
+                         sensors="\n".join(_sensor(sensor) for sensor in sensors))
+    with replacing(path) as partial:
+        partial.write_text(text)
 
 
 def up_axis(sensors: list[mi.Sensor]) -> int:

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
+from ..files import replacing
 
 #: Raised when the meaning of the arrays changes.
 FORMAT = 1
@@ -42,20 +43,16 @@ class Checkpoint:
         Raises:
             UserError: the folder is full or not writable; an older checkpoint stays as it was.
         """
-        partial = path.with_name(f".{path.name}.partial")
         header = json.dumps({"format": FORMAT, "stage": self.stage, "iteration": self.iteration,
                              "config": self.config, "seconds": self.seconds})
         try:
-            with open(partial, "wb") as file:
+            with replacing(path) as partial, open(partial, "wb") as file:
                 np.savez(file, header=np.array(header), **self.arrays)
                 file.flush()
                 os.fsync(file.fileno())
-            os.replace(partial, path)
         except OSError as error:
             raise UserError(f"Checkpoint '{path}' cannot be written ({error.strerror}); free some space or "
                             f"choose another folder with -o, then continue with --resume.") from error
-        finally:
-            partial.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:

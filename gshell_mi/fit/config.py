@@ -28,6 +28,8 @@ class FitConfig:
     """Cells per side of the lattice; default: that of the scene's gshell shape (64)."""
     checkpoint_seconds: float = 10.0
     """Seconds between checkpoints: what a kill loses at most."""
+    triptychs: int = 16
+    """Training views, spread evenly, that are rendered at the end: for views/ and for psnr_training."""
 
     # --- modes: what is known already
     known_light: bool = False
@@ -161,7 +163,8 @@ class FitConfig:
         return self.fixed_material or self.geometry_only
 
     def __post_init__(self):
-        for name in ("ghost_iterations", "ghost_batch", "ghost_sheets", "spp", "primal_spp", "light_height"):
+        for name in ("ghost_iterations", "ghost_batch", "ghost_sheets", "spp", "primal_spp", "light_height",
+                     "triptychs"):
             if getattr(self, name) < 1:
                 raise UserError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}.")
         if self.resolution is not None and self.resolution < 4:

@@ -22,6 +22,7 @@ from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..fields.moved_template import advect
 from ..fields.visual_hull import visual_hull
+from ..files import replacing
 from ..lattice import make_lattice
 from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
@@ -392,7 +393,8 @@ class _Fit:
                 step = json.loads(line) if line.endswith("\n") else None
                 if step and (STAGES.index(step["stage"]), step["iteration"]) < reached:
                     kept.append(line)
-        path.write_text("".join(kept))
+        with replacing(path) as partial:
+            partial.write_text("".join(kept))
 
     def _write_log(self, stage: str, iteration: int, values: dict[str, float], seconds: float) -> None:
         rounded = {name: float(f"{value:.6g}") for name, value in values.items()}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 import tempfile
 from dataclasses import dataclass
 from importlib.resources import files
@@ -19,6 +18,7 @@ from PIL import Image
 
 from ..errors import UserError
 from ..export.asset import write_asset
+from ..files import replacing
 from ..images import srgb
 from ..turntable import TurntableConfig, render_turntable, write_video
 from .curves import curves
@@ -73,9 +73,8 @@ def write_report(folder: Path, config: ReportConfig | None = None) -> Path:
         triptychs=_triptychs(folder / "views", config.views, metrics),
         curves=[Markup(drawing) for drawing in curves(folder / "log.jsonl")],
         probe=_image_url(_probe(folder / "light.exr")))
-    partial = folder / ".report.html.partial"
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, folder / "report.html")
+    with replacing(folder / "report.html") as partial:
+        partial.write_text(text, encoding="utf-8")
     return folder / "report.html"
 
 

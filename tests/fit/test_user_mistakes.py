@@ -32,7 +32,7 @@ def told(scene, tmp_path, capfd):
         *stages, sentence = capfd.readouterr().err.strip().splitlines()
         assert re.fullmatch(r"error: .+", sentence)
         # What was done before has its bar.
-        stages = [stage for stage in stages if not stage.startswith("memory: about")]
+        stages = [line for line in stages if line and not line.startswith("memory: about")]
         assert not stages or (whole and all("━" in stage for stage in stages))
         if not whole:
             assert (sorted(output.rglob("*")) if output.is_dir() else None) == before
