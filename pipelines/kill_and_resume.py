@@ -3,11 +3,11 @@
     python pipelines/kill_and_resume.py SCENE.xml WORK [--kills 10] [--whole 3] [--seed 0] [-- FIT OPTIONS]
 
 Whole fits come first; the last of them tells how long each part of a fit takes. Then a fit is started and
-killed at ``--kills`` moments drawn uniformly from that time, from the start of the process to the report; after
-each kill every file in the folder is read, and the fit goes on with ``--resume`` (or from the start, if it was
-killed before its first checkpoint). At the end the differences of the killed fit to the whole ones are printed
-beside those of the whole ones to each other: threads add up in an order that changes, so no two fits are the
-same. Exit code 1 if on average the killed fit is farther from the whole ones than any two of these are.
+killed at ``--kills`` moments drawn uniformly from that time, from the start of the process to the report;
+after each kill every file in the folder is read, and the fit goes on with ``--resume`` (or from the start, if
+it was killed before its first checkpoint). At the end the differences of the killed fit to the whole ones are
+printed beside those of the whole ones to each other: threads add up in an order that changes, so no two fits
+are the same. Exit code 1 if on average the killed fit is farther from the whole ones than any two of these.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def study(scene: Path, work: Path, options: list[str], *, kills: int, whole: int
 
 
 def farther(between: list[dict[str, float]], to_killed: list[dict[str, float]]) -> bool:
-    """Whether the killed fit's surface is on average farther from the whole ones than any two of these are."""
+    """Whether the killed fit's surface is on average farther from the whole ones than any two of these."""
     name = "distance %"
     return np.mean([entry[name] for entry in to_killed]) > max(entry[name] for entry in between)
 
