@@ -8,9 +8,12 @@ The rooms, in the order in which data flows through them:
 - ``capture``: photographs with known cameras become a fit scene, ``python -m gshell_mi.capture``
 - ``targets``, ``views``, ``scene``: what a fit starts from
 - ``losses``, ``material``, ``light``, ``fit``: the optimisation, ``python -m gshell_mi.fit``
+- ``viewer``: a look at it while it runs, ``--viewer``
 - ``images``, ``topology``, ``export``, ``turntable``, ``report``: what it leaves behind
 - ``evaluation``, ``compare``: how good it is
-- ``command_line``, ``doctor``, ``errors``: what the commands share; whether this machine can run it all
+- ``command_line``, ``doctor``, ``errors``, ``files``, ``memory``: what the commands share; whether this
+  machine can run it all
+- ``compat``, ``plugins``: what depends on Mitsuba's version, and how its plugins are registered
 
 Importing the package sets no variant; its plugins register for the variant in use and for every later one.
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import warnings
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -77,6 +79,14 @@ def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> mi.Mesh
     write_mesh(mesh, mi.Float(np.ascontiguousarray(vertices, np.float32).ravel()),
                mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel()))
     return mesh
+
+
+def write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:
+    """Writes an image by its suffix; unlike Mitsuba's error, its ``OSError`` says what is wrong and where."""
+    try:
+        bitmap.write(str(path))
+    except RuntimeError as error:
+        raise OSError(errno.EIO, str(error).rpartition(": ")[2], str(path)) from error
 
 
 def colour_science() -> ModuleType:

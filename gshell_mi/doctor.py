@@ -21,6 +21,7 @@ import mitsuba as mi
 
 from . import __version__, compat
 from .errors import UserError
+from .memory import GIB, free_memory
 
 _NAN_MINIMUM = platform.machine().lower() in ("x86_64", "amd64") and compat.DRJIT_VERSION >= (1, 5)
 
@@ -58,6 +59,8 @@ class Diagnosis:
     """Size of Dr.Jit's thread pool."""
     cuda: bool
     """Whether Dr.Jit found a CUDA device."""
+    free_memory: int | None = None
+    """Bytes of main memory that a fit may take; None if the system does not tell."""
     render_seconds: float | None = None
     """Time of the self-test's render including compilation; None if it did not run."""
     problems: tuple[str, ...] = ()
@@ -73,6 +76,7 @@ class Diagnosis:
             "variants": ", ".join(self.variants) or "none",
             "LLVM": llvm,
             "threads": str(self.threads),
+            "memory": f"{self.free_memory / GIB:.1f} GiB free" if self.free_memory else "unknown",
             "GPU": "CUDA device found" if self.cuda else "none (the llvm variant needs none)",
             "self-test": f"passed in {self.render_seconds:.1f} s" if self.render_seconds else "not run",
         }
@@ -93,6 +97,7 @@ def diagnose(*, self_test: bool = True) -> Diagnosis:
         llvm_path=_llvm_path(),
         threads=dr.thread_count(),
         cuda=dr.has_backend(dr.JitBackend.CUDA),
+        free_memory=free_memory(),
     )
     problem = _llvm_problem()
     if problem is None and self_test:

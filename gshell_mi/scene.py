@@ -9,6 +9,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from .compat import write_bitmap
 from .errors import UserError
 from .files import replacing
 from .targets import Target, load_target
@@ -140,9 +141,9 @@ def _render_missing_targets(path: Path, folder: Path, sensors: list[mi.Sensor],
         try:
             # A killed run must not leave half an image behind that the next run takes for a target.
             with replacing(target) as partial:
-                bitmap.convert(component_format=mi.Struct.Type.Float16).write(str(partial))
-        except (OSError, RuntimeError) as error:
-            raise UserError(f"Target '{target}' cannot be written ({error}); make the folder writable, "
-                            f"or name another with --targets.") from error
+                write_bitmap(bitmap.convert(component_format=mi.Struct.Type.Float16), partial)
+        except OSError as error:
+            raise UserError(f"Target '{target}' cannot be written ({error.strerror or error}); make the "
+                            f"folder writable, or name another with --targets.") from error
     if progress:
         progress(len(missing), len(missing))

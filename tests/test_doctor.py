@@ -95,5 +95,6 @@ def test_ensure_variant(variant):
 def test_report(capsys):
     assert doctor.main([]) == 0
     report = capsys.readouterr().out
-    for word in ("Python", "mitsuba", "drjit", "variants", "LLVM", "threads", "GPU", "self-test", "passed"):
+    for word in ("Python", "mitsuba", "drjit", "variants", "LLVM", "threads", "memory", "GPU", "self-test",
+                 "passed"):
         assert word in report

@@ -16,6 +16,7 @@ from xml.sax.saxutils import quoteattr
 import mitsuba as mi
 import numpy as np
 
+from ..compat import write_bitmap
 from ..errors import UserError
 from .camera import Camera
 
@@ -96,11 +97,7 @@ def write_target(path: Path, rgba: np.ndarray) -> None:
         OSError: it cannot be written.
     """
     bitmap = mi.Bitmap(np.ascontiguousarray(rgba, dtype=np.float32), mi.Bitmap.PixelFormat.RGBA)
-    bitmap = bitmap.convert(component_format=mi.Struct.Type.Float16)
-    try:
-        bitmap.write(str(path))
-    except RuntimeError as error:    # Mitsuba's, in place of an OSError
-        raise OSError(f"{path.name}: {str(error).strip().splitlines()[-1]}") from error
+    write_bitmap(bitmap.convert(component_format=mi.Struct.Type.Float16), path)
 
 
 def write_record(folder: Path, record: dict) -> None:

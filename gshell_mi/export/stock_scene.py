@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 import numpy as np
 
-from ..compat import environment_radiance
+from ..compat import environment_radiance, write_bitmap
 from ..files import replacing
 from ..material import ATTRIBUTES
 
@@ -75,7 +75,7 @@ def write_light(path: Path, given: mi.Emitter, optimised: EnvironmentLight | Non
             radiance = np.array(parameters["radiance.value"], np.float32).ravel()
             bitmap = mi.Bitmap(np.broadcast_to(radiance, (8, 16, 3)).astype(np.float32))
     with replacing(path) as partial:
-        bitmap.write(str(partial))
+        write_bitmap(bitmap, partial)
 
 
 def write_scene(path: Path, light: mi.Emitter, sensors: list[mi.Sensor]) -> None:
