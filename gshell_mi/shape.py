@@ -13,6 +13,7 @@ from .extraction import SurfaceMesh, extract
 from .extraction.surface_mesh import gather
 from .fields import LatticeFields, from_mesh, sphere
 from .lattice import make_lattice
+from .timing import phase
 
 _FIELDS = ("sdf", "msdf", "deform", "weights")
 _LATTICE_PREFIX = "lattice_"
@@ -179,7 +180,9 @@ class GShell(mi.Mesh):
         return replace(surface, vertices=type(surface.vertices)(p), faces=faces)
 
     def _extract(self) -> None:
-        self.surface = self._in_world(extract(self.lattice, **self._fields()))
+        with phase("extraction") as compute:
+            self.surface = self._in_world(extract(self.lattice, **self._fields()))
+            compute(self.surface.vertices)
         self._write()
 
     def _write(self) -> None:

@@ -1,4 +1,4 @@
-"""Target images: linear Rec.709 RGBA, colour premultiplied by alpha = coverage."""
+"""Target images (linear Rec.709 RGBA, colour premultiplied by alpha = coverage) and depth maps."""
 
 from __future__ import annotations
 
@@ -22,15 +22,17 @@ class Target:
         path: the file it came from.
         rgba: (height, width, 4) float32, linear, premultiplied by alpha.
         has_alpha: False if the file had none and 1 was assumed everywhere.
+        depth: (height, width) distances along the rays, world units, 0 where unknown; None without a map.
     """
 
     path: Path
     rgba: np.ndarray
     has_alpha: bool
+    depth: np.ndarray | None = None
 
 
 def load_target(path: Path, width: int, height: int) -> Target:
-    """Reads one target and checks that a fit can use it.
+    """Reads one target, with the depth map beside it if there is one, and checks that a fit can use it.
 
     Raises:
         UserError: the file is missing or unreadable, has another size than its sensor's film, holds
@@ -66,7 +68,41 @@ def load_target(path: Path, width: int, height: int) -> Target:
         raise UserError(f"Target '{path}' has alpha between {alpha.min():.3g} and {alpha.max():.3g}; "
                         f"alpha is coverage and lies between 0 and 1.")
     pixels[..., 3] = np.clip(alpha, 0.0, 1.0)
-    return Target(path, pixels, has_alpha)
+    depth = path.with_suffix(".depth.exr")
+    return Target(path, pixels, has_alpha, load_depth(depth, width, height) if depth.is_file() else None)
+
+
+def load_depth(path: Path, width: int, height: int) -> np.ndarray:
+    """Reads a depth map: per pixel the distance from the camera's centre to the surface, along the ray
+    through the pixel's centre, in world units.
+
+    Returns:
+        (height, width) float32; 0 where the file has 0, infinity or NaN, which say that nothing was measured.
+
+    Raises:
+        UserError: the file is unreadable, has another size than its sensor's film, more than one channel,
+            negative distances or none at all.
+    """
+    try:
+        distance = np.array(mi.Bitmap(str(path)), np.float32)
+    except Exception as error:
+        raise UserError(f"Depth map '{path}' cannot be read as an image ({_first_line(error)}); "
+                        f"write it again as an OpenEXR file.") from error
+    distance = distance.reshape(*distance.shape[:2], -1)
+    if distance.shape[2] > 1 and (distance != distance[..., :1]).any():
+        raise UserError(f"Depth map '{path}' has {distance.shape[2]} different channels; write one, the "
+                        f"distance along the ray.")
+    distance = np.where(np.isfinite(distance[..., 0]), distance[..., 0], 0.0)
+    if distance.shape != (height, width):
+        found_height, found_width = distance.shape
+        raise UserError(f"Depth map '{path}' is {found_width} x {found_height} pixels, but its sensor's film "
+                        f"is {width} x {height}; resize one of them.")
+    if distance.min() < 0:
+        raise UserError(f"Depth map '{path}' has negative distances; write how far the surface is from the "
+                        f"camera, along the ray.")
+    if not distance.any():
+        raise UserError(f"Depth map '{path}' holds no distance at all; delete it, or write some.")
+    return distance
 
 
 def _first_line(error: Exception) -> str:

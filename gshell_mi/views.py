@@ -78,6 +78,16 @@ class PinholeViews:
         direction = dr.normalize(across * film.x + down * film.y + corner)
         return mi.Ray3f(mi.Point3f(origin), direction)
 
+    def pixel_rays(self, view: int) -> mi.Ray3f:
+        """The rays through the pixels' centres of one view, row by row."""
+        width, height = (int(side) for side in self.sizes[view])
+        pixel = dr.arange(mi.UInt32, width * height)
+        row = pixel // dr.opaque(mi.UInt32, width)
+        column = pixel - row * dr.opaque(mi.UInt32, width)
+        size = dr.opaque(mi.Float, width), dr.opaque(mi.Float, height)
+        film = mi.Point2f((column + 0.5) / size[0], (row + 0.5) / size[1])
+        return self.rays(dr.opaque(mi.UInt32, view), film)
+
     @cached_property
     def _inverse_table(self) -> mi.Float:
         """Three vectors per view on the device: the rows of its basis' inverse."""

@@ -10,9 +10,9 @@ from ..errors import UserError
 
 #: Fields that are weights of losses.
 WEIGHTS = ("ghost_mask", "ghost_daylight", "ghost_binary", "ghost_closing", "ghost_chroma", "joint_mask",
-           "hole_opening", "hole_closing", "visible_outside", "visible_inside", "sdf_sign", "eikonal",
-           "template_smoothness", "material_smoothness", "albedo_chroma", "light_smoothness", "light_grey",
-           "flexicubes_deviation")
+           "joint_depth", "hole_opening", "hole_closing", "visible_outside", "visible_inside", "sdf_sign",
+           "eikonal", "template_smoothness", "material_smoothness", "albedo_chroma", "light_smoothness",
+           "light_grey", "flexicubes_deviation")
 
 
 @dataclass(frozen=True)
@@ -129,6 +129,8 @@ class FitConfig:
     """What compares a render with its target."""
     joint_mask: float = 4.0
     """Weight of the mask loss."""
+    joint_depth: float = 0.01
+    """Weight of the depth loss, in cells; only used with depth maps."""
     hole_opening: float = 0.0
     """Weight of what pulls the mSDF of the surface below 0, so that openings appear and can be judged."""
     hole_closing: float = 0.0

@@ -11,6 +11,7 @@ from ..fields.smoothing import LatticeDiffusion
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, principled
 from ..scene import FitScene
+from ..timing import phase
 from .config import FitConfig
 from .observer import Preview
 from .regularisers import Regularisers
@@ -67,23 +68,30 @@ class JointStage:
         """One step on one view; returns the losses."""
         config = self.config
         moving = iteration >= config.warmup * config.iterations or not self.shading.state
-        self._apply(geometry=moving)
+        with phase("scene update"):
+            self._apply(geometry=moving)
         index = self._view(iteration)
-        image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[index],
-                          integrator=self._integrator, spp=config.primal_spp, spp_grad=config.spp,
-                          seed=2 * iteration, seed_grad=2 * iteration + 1)
+        with phase("render") as compute:
+            image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[index],
+                              integrator=self._integrator, spp=config.primal_spp, spp_grad=config.spp,
+                              seed=2 * iteration, seed_grad=2 * iteration + 1)
+            compute(image)
         target = self._targets[index]
         color = losses.IMAGE_LOSSES[config.image_loss](image[..., :3], target[..., :3])
         mask = losses.mask_l2(image[..., 3], target[..., 3]) if self._sees_masks else mi.Float(0)
         regularisation, terms = self._regularisers(index)
         total = color + config.joint_mask * mask + regularisation
-        dr.backward(total)
+        with phase("backward") as compute:
+            dr.backward(total)
+            compute(*(dr.grad(value) for optimizer in (self.geometry, self.shading)
+                      for value in optimizer.values()))
         progress = iteration / max(config.iterations, 1)
         decay = 0.1**progress
-        if moving:
-            ratio = config.geometry_detail / config.geometry_smoothing
-            self._step_geometry(decay, config.geometry_smoothing * ratio**progress)
-        self._step_shading(decay)
+        with phase("optimiser"):
+            if moving:
+                ratio = config.geometry_detail / config.geometry_smoothing
+                self._step_geometry(decay, config.geometry_smoothing * ratio**progress)
+            self._step_shading(decay)
         error = dr.mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]), axis=None)
         return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
                 **{name: value[0] for name, value in terms.items()},

@@ -18,6 +18,12 @@ from ..scene import FitScene
 from ..views import PinholeViews
 from .config import FitConfig
 
+#: Coverage from which on a pixel shows one surface.
+_WHOLE = 0.99
+
+#: Depths that differ by more cells than this are those of different surfaces.
+_DEPTH_LIMIT = 4.0
+
 #: A boundary vertex is seen if nothing is nearer to the camera than this fraction of its distance.
 _UNTIL = 0.999
 
@@ -47,6 +53,8 @@ class Regularisers:
             "eikonal": lambda: losses.eikonal(self._in_cells("sdf"), self._subject.lattice),
             "template_smoothness": self._template_smoothness,
         }
+        if any(target.depth is not None for target in fit.targets):
+            terms["joint_depth"] = self._depth
         if self._subject.lattice.weight_count:
             terms["flexicubes_deviation"] = self._flexicubes_deviation
         if material:
@@ -119,6 +127,19 @@ class Regularisers:
 
     # --- the surface
 
+    def _depth(self) -> mi.Float:
+        target = self._fit.targets[self._view]
+        if target.depth is None:
+            return mi.Float(0)
+        known = mi.Float(target.depth.ravel())
+        ray, hit = self._first_hits
+        interaction = hit.compute_surface_interaction(ray, mi.RayFlags.All)
+        # Where a pixel is covered in part, its depth is a mixture of two surfaces.
+        valid = self._on_subject(hit) & (known > 0) & (self._alpha > _WHOLE)
+        # From the measured point to the tangent plane: at grazing angles a small step changes depth a lot.
+        scale = dr.abs(dr.dot(dr.detach(interaction.n), ray.d)) / self._subject.cell_size
+        return losses.depth_l1(dr.select(valid, interaction.t * scale, 0), known * scale, valid, _DEPTH_LIMIT)
+
     def _template_smoothness(self) -> mi.Float:
         normals = mi.Vector3f(self._template.vertex_normals())
         return losses.normal_variation(normals, mi.Vector3u(self._template.faces))
@@ -140,7 +161,7 @@ class Regularisers:
     def _albedo_chroma(self) -> mi.Float:
         ray, hit = self._first_hits
         interaction = hit.compute_surface_interaction(ray, mi.RayFlags.All)
-        on_subject = hit.is_valid() & (hit.shape == mi.ShapePtr(self._subject))
+        on_subject = self._on_subject(hit)
         albedo = mi.Color3f(interaction.shape.eval_attribute_3("vertex_color", interaction, on_subject))
         return losses.chroma_difference(albedo, self._color, on_subject & (self._alpha > 0.5))
 
@@ -164,14 +185,12 @@ class Regularisers:
     @cached_property
     def _first_hits(self) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
         """The rays through the pixels' centres of the present view, and what they meet first."""
-        width, height = (int(side) for side in self._views.sizes[self._view])
-        pixel = dr.arange(mi.UInt32, width * height)
-        row = pixel // dr.opaque(mi.UInt32, width)
-        column = pixel - row * dr.opaque(mi.UInt32, width)
-        film = mi.Point2f((column + 0.5) / width, (row + 0.5) / height)
         with dr.suspend_grad():
-            ray = self._views.rays(dr.opaque(mi.UInt32, self._view), film)
+            ray = self._views.pixel_rays(self._view)
             return ray, self._scene.ray_intersect_preliminary(ray)
+
+    def _on_subject(self, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+        return hit.is_valid() & (hit.shape == mi.ShapePtr(self._subject))
 
     @property
     def _alpha(self) -> mi.Float:

@@ -31,6 +31,8 @@ from ..topology import topology
 from ..views import PinholeViews
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
 from .config import FitConfig, default_output
+from .depth import check_depth
+from .findings import findings
 from .interrupt import Interrupt
 from .joint import JointStage
 from .memory import MemoryEstimate
@@ -114,6 +116,7 @@ class _Fit:
                                         before_targets=self._check_memory, on_reference=progress.reference)
             self.views = PinholeViews.from_sensors(self.scene.sensors)
             check_given(self.scene, config)
+            check_depth(self.scene, self.views)
         if not all(target.has_alpha for target in self.scene.targets):
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
         given = self.scene.subject.lattice
@@ -137,6 +140,7 @@ class _Fit:
             self.interrupt.check()
             with self.progress.stage("export", None), self._timed("export"):
                 metrics = export_fit(self.output, self.scene, joint, self.config)
+                metrics |= findings(self.scene, self.views, joint.scene, self.progress.warn)
             metrics = self._write_metrics(metrics)
             if self.report:
                 self._write_documents()

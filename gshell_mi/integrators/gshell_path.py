@@ -5,6 +5,7 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from ..errors import UserError
+from ..timing import phase
 from . import reparameterised_film, shadow_boundary
 from .path_sample import PathSample
 from .path_vertex import material_point, mis_weight, sample_direct, segment
@@ -64,7 +65,8 @@ class GShellPathIntegrator(ADIntegrator):
         return reparameterised_film.render_forward(self, scene, sensor, seed, spp)
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
-        reparameterised_film.render_backward(self, scene, grad_in, sensor, seed, spp)
+        with phase("render backward"):
+            reparameterised_film.render_backward(self, scene, grad_in, sensor, seed, spp)
 
     # ------------------------------------------------------------------ paths
 
