@@ -13,7 +13,7 @@ REPOSITORY = Path(__file__).parents[1]
 sys.path.insert(0, str(REPOSITORY / "pipelines"))
 
 from scene_builder import cloth, files, lights, modelling  # noqa: E402
-from scene_builder.objects import leaf, vase  # noqa: E402
+from scene_builder.objects import bowl, chair, lace, leaf, skirt, vase  # noqa: E402
 
 
 def ball(p):
@@ -54,6 +54,8 @@ def test_cut_that_keeps_all_or_splits(sphere):
     y = np.asarray(sphere.vertices)[:, 1]
     larger = modelling.cut(sphere, np.maximum(y - 0.2, -0.4 - y))
     assert larger.body_count == 1 and larger.vertices[:, 1].min() > 0.19
+    both = modelling.cut(sphere, np.maximum(y - 0.2, -0.4 - y), islands=True)
+    assert both.body_count == 2 and both.euler_number == 2
 
 
 def test_relax_evens_triangles_and_stays_on_the_surface(sphere):
@@ -67,6 +69,34 @@ def test_relax_evens_triangles_and_stays_on_the_surface(sphere):
     assert np.abs(nu(after.vertices[rim])).max() < 1e-4
     assert after.area_faces.min() > 3 * before.area_faces.min()
     assert np.median(np.ptp(after.face_angles, axis=1)) < np.median(np.ptp(before.face_angles, axis=1))
+
+
+def test_revolved_half_circle_is_a_cap():
+    angle = np.linspace(0, 0.6 * np.pi, 9)
+    profile = modelling.even_profile(np.stack([np.sin(angle), -np.cos(angle)], 1), 60)
+    steps = np.linalg.norm(np.diff(profile, axis=0), axis=1)
+    assert np.ptp(steps) < 0.01 * steps.mean()
+    cap = modelling.revolve(profile, 100)
+    assert cap.is_winding_consistent and cap.euler_number == 1
+    assert cap.area == pytest.approx(2 * np.pi * (1 - np.cos(0.6 * np.pi)), rel=0.005)
+    outwards = (cap.face_normals * cap.triangles_center).sum(1)
+    assert outwards.min() > 0.99
+
+
+def test_pattern_of_the_skirt_is_a_ring_of_even_triangles():
+    ring = skirt.cut_pattern(0.06)
+    assert ring.euler_number == 0 and ring.body_count == 1
+    assert ring.face_normals[:, 1].min() > 0.999, "upper side up"
+    assert np.degrees(ring.face_angles.min()) > 35
+    assert ring.area == pytest.approx(np.pi * (skirt.HEM**2 - skirt.WAIST**2), rel=0.01)
+
+
+def test_chair_has_one_seat_layer_and_closed_legs():
+    mesh = chair.build().mesh
+    seat = (np.abs(mesh.triangles_center) < [0.3, 0.2, 0.3]).all(1)
+    assert seat.any() and mesh.face_normals[seat, 1].min() > 0.8, "no underside"
+    low = mesh.vertices[:, 1] < -0.5
+    assert not modelling.boundary_vertices(mesh)[low].any(), "the legs' feet are closed"
 
 
 def test_distance_functions():
@@ -132,6 +162,9 @@ def test_fibonacci_sphere_is_even():
     d = files.fibonacci_sphere(48)
     assert np.linalg.norm(d, axis=1) == pytest.approx(1)
     assert np.linalg.norm(d.mean(0)) < 0.02
+    above = files.fibonacci_sphere(200, lowest=0.25)
+    assert above[:, 1].min() == pytest.approx(0.25, abs=0.005)
+    assert above.mean(0) == pytest.approx([0, 0.625, 0], abs=0.02), "even in solid angle"
     gap = 2 - 2 * (d @ d.T) + 4 * np.eye(48)
     assert np.sqrt(gap.min()) > 0.7 * np.sqrt(4 * np.pi / 48)
 
@@ -157,7 +190,7 @@ def test_written_scene_comes_back(tmp_path):
     assert written.astype(float) == pytest.approx(light, rel=1e-3)
 
 
-@pytest.mark.parametrize("module", [leaf, vase])
+@pytest.mark.parametrize("module", [bowl, lace, leaf, vase])
 def test_committed_truth_is_what_the_code_builds(module):
     item = module.build()
     name = module.__name__.split(".")[-1]
@@ -173,4 +206,4 @@ def test_command(tmp_path):
     assert {p.name for p in tmp_path.rglob("*") if p.is_file()} == {
         "leaf.xml", "sensors.xml", "test.xml", "reference.xml", "truth.ply", "light.exr"}
     result = subprocess.run([*command, "teapot"], capture_output=True, text=True)
-    assert result.returncode == 2 and "no such object: teapot; there are bunny" in result.stderr
+    assert result.returncode == 2 and "no such object: teapot; there are basket" in result.stderr

@@ -1,6 +1,7 @@
 """Writing an object as a scene: sensors, XML, PLY and EXR files."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
@@ -25,6 +26,8 @@ class SceneObject:
     roughness: float = 0.8
     metallic: float = 0.0
     views: int = 48
+    lowest_view: float = -1.0
+    """Sine of the elevation of the lowest view: -1 for views from all around, 0 from above only."""
     resolution: int = 64
 
 
@@ -34,10 +37,11 @@ def centred(mesh: trimesh.Trimesh) -> np.ndarray:
     return (np.asarray(mesh.vertices) - (lo + hi) / 2) * (2 * HALF_EXTENT / (hi - lo).max())
 
 
-def fibonacci_sphere(n: int, turn: float = 0.0) -> np.ndarray:
-    """``n`` directions spread evenly over the sphere (golden-angle spiral about y), ``(n, 3)``."""
+def fibonacci_sphere(n: int, turn: float = 0.0, lowest: float = -1.0) -> np.ndarray:
+    """``n`` directions spread evenly over the sphere above y = ``lowest``, ``(n, 3)``: a golden-angle spiral
+    about y."""
     k = np.arange(n)
-    y = 1 - (2 * k + 1) / n
+    y = 1 - (1 - lowest) / 2 * (2 * k + 1) / n
     phi = k * np.pi * (3 - 5**0.5) + turn
     r = np.sqrt(1 - y * y)
     return np.stack([r * np.cos(phi), y, r * np.sin(phi)], 1)
@@ -78,11 +82,13 @@ def write_scene(name: str, item: SceneObject, folder: Path) -> None:
     vertices = centred(item.mesh)
     distance = 1.04 * np.linalg.norm(vertices, axis=1).max() / np.sin(np.radians(FOV / 2))
 
+    around = partial(fibonacci_sphere, lowest=item.lowest_view)
+
     def sensors(prefix: str, directions: np.ndarray) -> list[str]:
         return [sensor_xml(f"{prefix}_{i:03}", distance * d) for i, d in enumerate(directions)]
 
-    (inside / "sensors.xml").write_text(scene_xml(*sensors("view", fibonacci_sphere(item.views))))
-    (inside / "test.xml").write_text(scene_xml(*sensors("test", fibonacci_sphere(12, turn=1.0)), spp=256))
+    (inside / "sensors.xml").write_text(scene_xml(*sensors("view", around(item.views))))
+    (inside / "test.xml").write_text(scene_xml(*sensors("test", around(12, turn=1.0)), spp=256))
     (folder / f"{name}.xml").write_text(scene_xml(
         f"""    <!-- The unknown: fills the cube [-1, 1]^3. -->
     <shape type="gshell" id="subject">

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 import skimage.measure
 import trimesh
+from scipy.interpolate import PchipInterpolator
 
 Field = Callable[[np.ndarray], np.ndarray]
 
@@ -84,10 +85,11 @@ def isosurface(f: Field, lo, hi, cell: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(v + lo, faces, process=True)
 
 
-def cut(mesh: trimesh.Trimesh, nu: np.ndarray) -> trimesh.Trimesh:
-    """The largest part of ``{nu >= 0}`` on a mesh; ``nu`` is given per vertex and interpolated along edges.
+def cut(mesh: trimesh.Trimesh, nu: np.ndarray, *, islands: bool = False) -> trimesh.Trimesh:
+    """The part ``{nu >= 0}`` of a mesh; ``nu`` is given per vertex and interpolated along edges.
 
-    Boundary vertices are shared by the triangles they bound, so the result is welded.
+    Of a part in several pieces only the largest is kept, unless ``islands``. Boundary vertices are shared by
+    the triangles they bound, so the result is welded.
     """
     # A vertex almost on the cut would leave slivers: decide it to be inside.
     nu = np.where(np.abs(nu) < 1e-9, 1e-9, nu)
@@ -112,7 +114,11 @@ def cut(mesh: trimesh.Trimesh, nu: np.ndarray) -> trimesh.Trimesh:
         np.stack([ab, b, c], 1)[~one],
         np.stack([ab, c, ac], 1)[~one],
     ])
-    return largest_component(trimesh.Trimesh(np.concatenate([v, new]), faces, process=True))
+    part = trimesh.Trimesh(np.concatenate([v, new]), faces, process=True)
+    # Where the cut runs through a vertex, triangles have shrunk to points and lines.
+    part.update_faces(part.nondegenerate_faces())
+    part.remove_unreferenced_vertices()
+    return part if islands else largest_component(part)
 
 
 def largest_component(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -149,3 +155,27 @@ def relax(mesh: trimesh.Trimesh, f: Field, nu: Field | None = None, steps: int =
                 w = project(f, project(nu, w, 1), 1)
             v[rim] = w
     return trimesh.Trimesh(v, mesh.faces, process=False)
+
+
+def even_profile(points: np.ndarray, n: int) -> np.ndarray:
+    """``n`` points evenly spaced along a smooth curve through ``points``, all ``(.., 2)``: radius, height."""
+    along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    dense = PchipInterpolator(along, points)(np.linspace(0, along[-1], 4000))
+    length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(dense, axis=0), axis=1))]
+    at = np.linspace(0, length[-1], n)
+    return np.stack([np.interp(at, length, dense[:, i]) for i in range(2)], 1)
+
+
+def revolve(profile: np.ndarray, sides: int) -> trimesh.Trimesh:
+    """Turns a profile that starts on the axis about y; one pole, one open rim, faces outwards."""
+    n = len(profile) - 1
+    phi = np.arange(sides) / sides * 2 * np.pi
+    r, y = profile[1:, :1], profile[1:, 1:]
+    ring = np.stack([r * np.cos(phi), np.broadcast_to(y, (n, sides)), r * np.sin(phi)], -1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(n - 1), np.arange(sides), indexing="ij")
+    a, b = i * sides + j, i * sides + (j + 1) % sides
+    quads = np.stack([a, a + sides, b + sides, a, b + sides, b], -1).reshape(-1, 3)
+    j = np.arange(sides)
+    pole = np.stack([np.full(sides, n * sides), j, (j + 1) % sides], 1)
+    vertices = np.concatenate([ring, [[0, profile[0, 1], 0]]])
+    return trimesh.Trimesh(vertices, np.concatenate([quads, pole]), process=False)
