@@ -19,14 +19,13 @@ ROOT = Path(__file__).parents[1]
 
 @dataclass(frozen=True)
 class GradientScene:
-    """A scene and the motion of its mesh ``subject``."""
+    """A scene, whose emitters are to be hidden, and the motion of its mesh ``subject``."""
 
     name: str                   #: short name, also of the image file
     about: str                  #: what it shows
     build: Callable             #: resolution in pixels -> (scene, motion of the vertices, V x 3)
     depth: int = 2              #: path length (``max_depth``)
-    step: float = 0.08          #: of the finite differences, in units of the parameter
-    hide_emitters: bool = True
+    step: float = 0.01          #: of the finite differences, in units of the parameter
 
 
 def make_mesh(name, vertices, faces, bsdf=None, *, uv=None, smooth=True):
@@ -72,10 +71,7 @@ def constant(radiance=1.0):
 
 
 def load(sensor, light, subject, **others):
-    """A scene with the sensor twice, the second time with stratified samples for finite differences."""
-    return mi.load_dict({"type": "scene", "sensor": sensor,
-                         "stratified": {**sensor, "sampler": {"type": "multijitter"}},
-                         "light": light, "subject": subject, **others})
+    return mi.load_dict({"type": "scene", "sensor": sensor, "light": light, "subject": subject, **others})
 
 
 def sphere(level=3, radius=1.0, centre=(0, 0, 0)):
@@ -203,12 +199,14 @@ def _seam_self_shadowed(resolution):
     return (load(camera(resolution, (1, 1.5, 4)), sky(), make_mesh("subject", v, f, uv=uv)), translation(v))
 
 
-def _textured_light(resolution):
-    v, f = sphere(3, 0.8)
-    to_world = mi.ScalarTransform4f().look_at([1.5, 2.5, 2.5], [0, 0, 0], [0, 1, 0])
-    light = {"type": "rectangle", "to_world": to_world,
-             "emitter": {"type": "area", "radiance": {**chequers(4)}}}
-    return load(camera(resolution), light, make_mesh("subject", v, f)), translation(v)
+def _textured_light(smooth):
+    def build(resolution):
+        v, f = sphere(3, 0.8)
+        to_world = mi.ScalarTransform4f().look_at([1.5, 2.5, 2.5], [0, 0, 0], [0, 1, 0])
+        light = {"type": "rectangle", "to_world": to_world,
+                 "emitter": {"type": "area", "radiance": {**chequers(4)}}}
+        return load(camera(resolution), light, make_mesh("subject", v, f, smooth=smooth)), translation(v)
+    return build
 
 
 def _coarse(resolution):
@@ -265,6 +263,11 @@ def _point_light(position=(2, 4, 1)):
     return {"type": "point", "position": list(position), "intensity": {"type": "rgb", "value": [16.0] * 3}}
 
 
+def _directional_light():
+    return {"type": "directional", "direction": [-0.4, -1, -0.2],
+            "irradiance": {"type": "rgb", "value": [1.0] * 3}}
+
+
 def _area_light():
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f().look_at([2, 4, 1], [0, 0, 0], [0, 0, 1])
             .scale(0.7), "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [6.0] * 3}}}
@@ -282,17 +285,21 @@ SCENES = (
     GradientScene("seam_over_rough_mirror", "texture seam over a rough mirror (#1648)", _seam_over_mirror, 3,
                   step=0.04),
     GradientScene("seam_self_shadowed", "texture seam, self-shadowed (#1648)", _seam_self_shadowed),
-    GradientScene("textured_area_light", "spatially varying emitter (#1506)", _textured_light),
+    GradientScene("textured_area_light", "spatially varying emitter (#1506)", _textured_light(True)),
+    GradientScene("many_flat_faces", "the same, flat-shaded at small angles", _textured_light(False)),
     GradientScene("coarse_shading_rim", "coarse mesh, normals turned away at the silhouette", _coarse),
     GradientScene("border_sampled", "sample_border, object at the frame (#1954)", _frame(True)),
     GradientScene("leaving_the_frame", "object leaving the frame", _frame(False)),
     GradientScene("box_filter", "box reconstruction filter", _box_filter),
-    GradientScene("occluder", "static occluder in front", _occluder),
+    GradientScene("occluder", "static occluder in front", _occluder, step=0.02),
     GradientScene("open_box", "interreflection in an open box", _open_box, 3),
-    GradientScene("thin_sheet_edge_on", "sheet seen almost from its edge", _thin_sheet, step=0.015),
+    GradientScene("thin_sheet_edge_on", "sheet seen almost from its edge", _thin_sheet, step=0.0025),
     GradientScene("shadow_environment", "shadow on a plane, environment", _shadow_on_plane(constant)),
     GradientScene("shadow_area_light", "shadow on a plane, area light", _shadow_on_plane(_area_light)),
-    GradientScene("shadow_point_light", "hard shadow, point light", _shadow_on_plane(_point_light)),
+    GradientScene("shadow_point_light", "hard shadow, point light", _shadow_on_plane(_point_light),
+                  step=0.08),
+    GradientScene("shadow_directional", "hard shadow, directional light",
+                  _shadow_on_plane(_directional_light), step=0.08),
 )
 
 
@@ -337,18 +344,3 @@ def reverse_derivative(mover, integrator, spp, seed, weights) -> float:
     image = mi.render(mover.scene, mover.params, integrator=integrator, spp=spp, seed=seed)
     dr.backward(dr.sum(image[:, :, :3] * mi.TensorXf(weights)))
     return float(dr.grad(t)[0])
-
-
-def finite_difference(mover, case, step, spp, seed, sensor=0) -> np.ndarray:
-    """Central difference of two stock renderings with equal seeds, H x W x 4.
-
-    ``sensor``: 0, or 1 for stratified samples (less noise, but longer to compile).
-    """
-    integrator = mi.load_dict({"type": "path", "max_depth": case.depth, "hide_emitters": case.hide_emitters})
-    images = []
-    for t in (step, -step):
-        mover.to(mi.Float(t))
-        images.append(np.array(mi.render(mover.scene, sensor=sensor, integrator=integrator, spp=spp,
-                                         seed=1000 + seed)))
-    mover.to(mi.Float(0))
-    return (images[0] - images[1]) / (2 * step)

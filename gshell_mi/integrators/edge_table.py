@@ -138,3 +138,20 @@ def scene_edge_tables(scene):
     return [(shape, build_edge_table(shape.vertex_positions_buffer(), shape.faces_buffer()))
             for shape in scene.shapes()
             if shape.is_mesh() and shape.face_count() > 0 and shape.vertex_count() > 2]
+
+
+def join(arrays):
+    """One array of several; ``dr.concat`` would bake the sizes into the kernel, scattering does not."""
+    if len(arrays) == 1:
+        return arrays[0]
+    result = dr.zeros(type(arrays[0]), sum(dr.width(x) for x in arrays))
+    offset = 0
+    for x in arrays:
+        index = dr.arange(mi.UInt32, dr.width(x)) + dr.opaque(mi.UInt32, offset)
+        if dr.depth_v(x) == 1:
+            dr.scatter(result, x, index, mode=dr.ReduceMode.Permute)
+        else:
+            for k in range(len(x)):
+                dr.scatter(result[k], x[k], index, mode=dr.ReduceMode.Permute)
+        offset += dr.width(x)
+    return result

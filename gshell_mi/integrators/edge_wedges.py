@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .edge_table import SIZE_INDEPENDENT
+from .edge_table import SIZE_INDEPENDENT, join
 from .silhouette_edges import crease_mask
 
 #: Narrower lunes (radians) are those of flat faces, whose angle rounding errors make up.
@@ -58,7 +58,7 @@ def silhouette_for(direction, inward, across, low, high):
     return (at_low * at_high > 0) & (dr.pi - (high - low) > _FLAT)
 
 
-def build_edge_wedges(tables, crease_angle=10.0):
+def build_edge_wedges(tables, crease_angle=0.1):
     """The wedges of all edges of the meshes of ``scene_edge_tables``, or ``None`` without edges."""
     parts, buffers, offset = [], [], 0
     for mesh, table in tables:
@@ -110,21 +110,4 @@ def _mesh_wedges(mesh, table, crease_angle, offset):
     result = [start + offset, end + offset, opposite + offset, low, high, crease,
               mass + dr.zeros(mi.Float, dr.width(keep))]
     dr.eval(result)
-    return result
-
-
-def join(arrays):
-    """One array of several; ``dr.concat`` would bake the sizes into the kernel, scattering does not."""
-    if len(arrays) == 1:
-        return arrays[0]
-    result = dr.zeros(type(arrays[0]), sum(dr.width(x) for x in arrays))
-    offset = 0
-    for x in arrays:
-        index = dr.arange(mi.UInt32, dr.width(x)) + dr.opaque(mi.UInt32, offset)
-        if dr.depth_v(x) == 1:
-            dr.scatter(result, x, index, mode=dr.ReduceMode.Permute)
-        else:
-            for k in range(len(x)):
-                dr.scatter(result[k], x[k], index, mode=dr.ReduceMode.Permute)
-        offset += dr.width(x)
     return result

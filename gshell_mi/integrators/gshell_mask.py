@@ -30,7 +30,7 @@ class GShellMaskIntegrator(ADIntegrator):
         self.warp_radius = props.get("warp_radius", 2.0)
         self.cull_hidden = props.get("cull_hidden", True)
         self.said = set()   # warnings given so far
-        self.crease_angle = props.get("crease_angle", 10.0)
+        self.crease_angle = props.get("crease_angle", 0.1)
 
     def aov_names(self):
         return ["depth", "normal.x", "normal.y", "normal.z"]

@@ -7,8 +7,10 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 from ..errors import UserError
 from ..timing import phase
 from . import reparameterised_film, shadow_boundary
+from .path_replay import replay
 from .path_sample import PathSample
-from .path_vertex import material_point, mis_weight, sample_direct, segment
+from .path_vertex import delta_lobe, material_point, mis_weight, sample_direct, scattering, segment
+from .supported_scenes import has_bsdf_flag, has_surface_emitters
 
 
 class GShellPathIntegrator(ADIntegrator):
@@ -30,7 +32,7 @@ class GShellPathIntegrator(ADIntegrator):
       need 2; fits of whole objects do as well without, in less time (``docs/gradients.md``).
     * ``warp_radius`` (float, default 2 pixels): how far the warp reaches around a silhouette.
     * ``light_edge_samples`` (float, default 1): samples of shadow boundaries per pixel of the film.
-    * ``crease_angle`` (float, default 10 degrees): edges of flat-shaded meshes above it count as
+    * ``crease_angle`` (float, default 0.1 degrees): edges of flat-shaded meshes above it count as
       silhouettes do.
     * ``cull_hidden`` (bool, default true): leave out silhouettes that other surfaces hide.
 
@@ -52,7 +54,7 @@ class GShellPathIntegrator(ADIntegrator):
         if self.reparam_depth not in (1, 2, 3):
             raise UserError(f"gshell_path: reparam_depth is {self.reparam_depth}, but has to be 1, 2 or 3.")
         self.said = set()   # warnings given so far
-        self.crease_angle = props.get("crease_angle", 10.0)
+        self.crease_angle = props.get("crease_angle", 0.1)
         self.light_edge_samples = props.get("light_edge_samples", 1.0)
 
     # ------------------------------------------------------------------ rendering
@@ -70,10 +72,10 @@ class GShellPathIntegrator(ADIntegrator):
 
     # ------------------------------------------------------------------ paths
 
-    def _first_hit(self, scene, ray, active=True):
+    def first_hit(self, scene, ray, active=True):
         """The first intersection, behind the area lights if emitters are hidden."""
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        if self.hide_emitters and _has_surface_emitters(scene):
+        if self.hide_emitters and has_surface_emitters(scene):
             skip = pi.is_valid() & (pi.shape.emitter() != None) & active  # noqa: E711
             si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip)
             pi[skip] = self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, skip)
@@ -91,8 +93,9 @@ class GShellPathIntegrator(ADIntegrator):
         L, beta, eta = mi.Spectrum(0), mi.Spectrum(1), mi.Float(1)
         active = mi.Bool(active)
         scattered = mi.Bool(start > 0)     # past the surfaces that camera rays just pass through
+        transparent = has_bsdf_flag(scene, mi.BSDFFlags.Null)
         if dr.hint(start == 0, mode="scalar"):
-            pi = self._first_hit(scene, ray, active)
+            pi = self.first_hit(scene, ray, active)
         else:
             pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         si_prev = dr.zeros(mi.SurfaceInteraction3f)
@@ -104,18 +107,19 @@ class GShellPathIntegrator(ADIntegrator):
             shines = active
             if dr.hint(start > 0, mode="scalar"):
                 shines = active & ~((depth == start) & si.is_valid())
-            L += beta * self._emission(scene, si, si_prev, pdf_prev, delta_prev, scattered, shines)
+            L += beta * self.emission(scene, si, si_prev, pdf_prev, delta_prev, scattered, shines)
             active_next = active & (depth + 1 < self.max_depth) & si.is_valid()
             L += beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, False, False)
-            sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(),
-                                         active_next)
+            # Whether the last surface of a path covers the film is sampled too.
+            sampled = active & si.is_valid() if transparent else active_next
+            sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), sampled)
             scattered |= active & si.is_valid() & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
             ray = si.spawn_ray(si.to_world(sample.wo))
             beta *= weight
             eta *= sample.eta
             si_prev = si
             pdf_prev, delta_prev = sample.pdf, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-            beta, active_next = self._roulette(beta, eta, depth, sampler, active_next)
+            beta, active_next = self.roulette(beta, eta, depth, sampler, active_next)
             pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active_next)
             depth[si.is_valid()] += 1
             active = active_next
@@ -123,7 +127,7 @@ class GShellPathIntegrator(ADIntegrator):
         covered = scattered | (not self.hide_emitters and scene.environment() is not None)
         return PathSample(L, dr.select(covered, mi.Float(1), mi.Float(0)), [])
 
-    def _emission(self, scene, si, si_prev, pdf_prev, delta_prev, scattered, active):
+    def emission(self, scene, si, si_prev, pdf_prev, delta_prev, scattered, active):
         """Light emitted at a vertex towards the one before, weighted against emitter sampling."""
         if self.hide_emitters:
             active = active & (scattered | si.is_valid())
@@ -131,7 +135,7 @@ class GShellPathIntegrator(ADIntegrator):
         emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, ~delta_prev)
         return mis_weight(pdf_prev, emitter_pdf) * ds.emitter.eval(si, active)
 
-    def _roulette(self, beta, eta, depth, sampler, active):
+    def roulette(self, beta, eta, depth, sampler, active):
         peak = dr.max(mi.unpolarized_spectrum(beta))
         survive = dr.minimum(peak * dr.square(eta), 0.95)
         play = depth >= self.rr_depth
@@ -147,7 +151,7 @@ class GShellPathIntegrator(ADIntegrator):
 
     def replays(self, scene):
         """Whether ``attached`` needs to know the radiance and coverage of its samples beforehand."""
-        return self.max_depth > 3 or _has_bsdf_flag(scene, mi.BSDFFlags.Delta)
+        return self.max_depth > 3 or has_bsdf_flag(scene, mi.BSDFFlags.Delta)
 
     def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
         """Derivatives of camera paths.
@@ -164,7 +168,7 @@ class GShellPathIntegrator(ADIntegrator):
             total = on_sample(radiance, alpha, state.aovs)
             if tail is not None:
                 with dr.suspend_grad():
-                    on_last = self._replay(mode, *tail, _adjoint_of_value(on_sample, state), mi.Vector3f(0))
+                    on_last = replay(self, mode, *tail, _adjoint_of_value(on_sample, state), mi.Vector3f(0))
                 total += dr.dot(last, on_last)
             return total, state
         # Interior gradients are results too, and the replay needs those of the inputs again.
@@ -173,7 +177,7 @@ class GShellPathIntegrator(ADIntegrator):
         film_tangents = [dr.grad(x) for x in film_terms]
         if tail is not None:
             with dr.suspend_grad():
-                tangent += self._replay(mode, *tail, mi.Spectrum(0), mi.Vector3f(dr.grad(last)))
+                tangent += replay(self, mode, *tail, mi.Spectrum(0), mi.Vector3f(dr.grad(last)))
         return on_sample(tangent, alpha_tangent, []), film_tangents
 
     def _first_vertices(self, scene, sampler, ray, state):
@@ -183,18 +187,18 @@ class GShellPathIntegrator(ADIntegrator):
         remaining vertices takes, or ``None`` if the paths end here. Nothing else that is attached may
         outlive this function: forward mode stumbles over dangling variables.
         """
-        surface_emitters = _has_surface_emitters(scene)
-        special = _has_bsdf_flag(scene, mi.BSDFFlags.Delta)
+        surface_emitters = has_surface_emitters(scene)
+        special = has_bsdf_flag(scene, mi.BSDFFlags.Delta)
         context = mi.BSDFContext()
         deeper = self.max_depth > 3
         depth = mi.UInt32(0)
         with dr.suspend_grad():
-            pi = self._first_hit(scene, dr.detach(ray))
+            pi = self.first_hit(scene, dr.detach(ray))
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         bsdf = si.bsdf(mi.RayDifferential3f(dr.detach(ray)))
         active = mi.Bool(True)
         no_vertex = dr.zeros(mi.SurfaceInteraction3f)
-        radiance = self._emission(scene, si, no_vertex, mi.Float(1), mi.Bool(True), mi.Bool(False), active)
+        radiance = self.emission(scene, si, no_vertex, mi.Float(1), mi.Bool(True), mi.Bool(False), active)
         scattered = mi.Bool(False)
         throughput = mi.Spectrum(1)     # of value 1, carries the derivatives of the vertices so far
         beta, eta = mi.Spectrum(1), mi.Float(1)
@@ -216,19 +220,19 @@ class GShellPathIntegrator(ADIntegrator):
                 delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
                 scattered |= ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
                 eta *= sample.eta
-                beta, active = self._roulette(beta * weight, eta, depth, sampler, active)
+                beta, active = self.roulette(beta * weight, eta, depth, sampler, active)
                 pi = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active)
             depth = depth + 1
             to_point = None
             if surface_emitters or vertex == 1:
                 p_next, area_next = material_point(pi, ray_next, active)
                 d, solid_angle = segment(si.p, p_next, area_next, active & pi.is_valid(), ray_next.d)
-                to_point = throughput * self._scattering(bsdf, si, d, solid_angle, sample, active, special)
+                to_point = throughput * scattering(bsdf, si, d, solid_angle, sample, active, special)
             if vertex == 1:
                 if not deeper:    # else the replay counts what the last vertex emits
                     last = pi.compute_surface_interaction(
                         ray_next, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-                    radiance += to_point * beta * self._emission(scene, last, si_now, sample.pdf, delta,
+                    radiance += to_point * beta * self.emission(scene, last, si_now, sample.pdf, delta,
                                                                  scattered, active)
                 break
             # Light of emitters arrives from a point of theirs, all other along a fixed direction: in
@@ -237,13 +241,13 @@ class GShellPathIntegrator(ADIntegrator):
             along.o = dr.replace_grad(ray_next.o, si.p)
             change = dr.relative_grad(bsdf.eval(context, si, si.to_local(ray_next.d), active))
             if special:
-                d, change, seen = self._delta_lobe(bsdf, si, ray, ray_next, choice, sample2, delta, active,
+                d, change, seen = delta_lobe(bsdf, si, ray, ray_next, choice, sample2, delta, active,
                                                    sample.sampled_type, change)
                 alpha *= 1 if always else seen
                 along.d = dr.replace_grad(ray_next.d, d)
             throughput = throughput * change
             si_next = pi.compute_surface_interaction(along, mi.RayFlags.All, active)
-            emitted = beta * self._emission(scene, si_next, si_now, sample.pdf, delta, scattered, active)
+            emitted = beta * self.emission(scene, si_next, si_now, sample.pdf, delta, scattered, active)
             if surface_emitters:
                 emitted *= dr.select(pi.is_valid() & ~delta, to_point, throughput)
             else:
@@ -258,116 +262,10 @@ class GShellPathIntegrator(ADIntegrator):
         return radiance, alpha, si.p, (scene, sampler, ray_next, pi, si_now, rest, beta, eta, sample.pdf,
                                        delta, active, depth, scattered)
 
-    def _scattering(self, bsdf, si, d, solid_angle, sample, active, special):
-        """Factor of value 1 with the derivative of scattering towards a point.
-
-        Where light just passes through (``mask``), of the transmission; the geometry of such a
-        segment is that of the surfaces at its ends and is left out.
-        """
-        change = dr.relative_grad(bsdf.eval(mi.BSDFContext(), si, si.to_local(d), active)) * solid_angle
-        if not special:
-            return change
-        passes = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
-        return dr.select(passes, dr.relative_grad(bsdf.eval_null_transmission(si, active)), change)
-
-    def _delta_lobe(self, bsdf, si, ray, ray_next, choice, sample2, delta, active, kind, change):
-        """Direction, and relative weight and coverage, where the first surface scatters in one direction.
-
-        A mirrored or refracted direction follows the surface, and one that passes through (``mask``)
-        the camera ray; the chance to pass is the opacity's complement.
-        """
-        context = mi.BSDFContext()
-        passes = active & mi.has_flag(kind, mi.BSDFFlags.Null)
-        sample, weight = bsdf.sample(context, si, choice, sample2, active)
-        transmission = bsdf.eval_null_transmission(si, active)
-        d = dr.select(passes, ray.d, dr.select(delta, si.to_world(sample.wo), ray_next.d))
-        change = dr.select(passes, dr.relative_grad(transmission),
-                           dr.select(delta, dr.relative_grad(weight), change))
-        opacity = 1 - dr.mean(mi.unpolarized_spectrum(transmission))
-        seen = dr.select(passes, dr.relative_grad(1 - opacity), dr.relative_grad(opacity))
-        return d, change, dr.select(active, seen, 1)
-
-    @dr.syntax
-    def _replay(self, mode, scene, sampler, ray, pi, si_prev, L, beta, eta, pdf_prev, delta_prev, active,
-                depth, scattered, adjoint, p_tangent):
-        """Path replay (Vicini et al. 2021) of the remaining vertices.
-
-        Reverse mode takes the adjoint of the radiance and returns that of the position of the vertex
-        before; forward mode takes the tangent of that position and returns the radiance's.
-        """
-        surface_emitters = _has_surface_emitters(scene)
-        special = _has_bsdf_flag(scene, mi.BSDFFlags.Delta)
-        backward = mode == dr.ADMode.Backward
-        depth, start = mi.UInt32(depth), mi.UInt32(depth)
-        tangent = mi.Spectrum(0)
-        on_first = mi.Vector3f(0)
-        first_p = mi.Point3f(si_prev.p)
-        pi_prev, ray_prev = dr.zeros(mi.PreliminaryIntersection3f, dr.width(pi)), mi.Ray3f(ray)
-        active, scattered = mi.Bool(active), mi.Bool(scattered)
-
-        while dr.hint(active, max_iterations=self.max_depth - 2, label="gshell_path (replay)"):
-            second = depth == start
-            with dr.resume_grad():
-                p_first = mi.Point3f(first_p)
-                dr.enable_grad(p_first)
-                if dr.hint(not backward, mode="scalar"):
-                    dr.set_grad(p_first, p_tangent)
-                p_prev = pi_prev.compute_surface_interaction(
-                    ray_prev, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, active & ~second).p
-                p_prev = dr.select(second, p_first, p_prev)
-                si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-                wi = si.to_local(dr.normalize(p_prev - si.p))
-                si.wi = dr.replace_grad(si.wi, dr.select(si.is_valid(), wi, si.wi))
-                emitted = beta * self._emission(scene, si, si_prev, pdf_prev, delta_prev, scattered, active)
-            si_now = dr.detach(si)
-            bsdf = si_now.bsdf(mi.RayDifferential3f(ray))
-            active_next = active & (depth + 1 < self.max_depth) & si_now.is_valid()
-            with dr.resume_grad():
-                direct = beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, True,
-                                              surface_emitters)
-            sample, weight = bsdf.sample(mi.BSDFContext(), si_now, sampler.next_1d(), sampler.next_2d(),
-                                         active_next)
-            L -= dr.detach(emitted) + dr.detach(direct)
-            ray_next = si_now.spawn_ray(si_now.to_world(sample.wo))
-            beta *= weight
-            eta *= sample.eta
-            beta, active_next = self._roulette(beta, eta, depth, sampler, active_next)
-            pi_next = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active_next)
-            with dr.resume_grad():
-                p_next, area_next = material_point(pi_next, ray_next, active_next)
-                d, solid_angle = segment(si.p, p_next, area_next, active_next & pi_next.is_valid(),
-                                         ray_next.d)
-                change = self._scattering(bsdf, si, d, solid_angle, sample, active_next, special)
-                indirect = dr.select(active_next, L * change, 0)
-                radiance = emitted + direct + indirect
-                if dr.hint(backward, mode="scalar"):
-                    dr.backward_from(adjoint * radiance)
-                    on_first += dr.select(active & second, mi.Vector3f(dr.grad(p_first)), 0)
-                else:
-                    tangent += dr.forward_to(radiance)
-            si_prev = si_now
-            scattered |= active & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
-            pdf_prev, delta_prev = sample.pdf, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-            depth[si_now.is_valid()] += 1
-            pi_prev, pi = pi, pi_next
-            ray_prev, ray = ray, ray_next
-            active = active_next
-
-        return on_first if backward else tangent
-
     def to_string(self):
         return (f"GShellPathIntegrator[max_depth={self.max_depth}, rr_depth={self.rr_depth}, "
                 f"hide_emitters={self.hide_emitters}, "
                 f"reparam_depth={self.reparam_depth}, warp_radius={self.warp_radius}]")
-
-
-def _has_surface_emitters(scene):
-    return any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in scene.emitters())
-
-
-def _has_bsdf_flag(scene, flag):
-    return any(shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), flag)
-               for shape in scene.shapes())
 
 
 def _adjoint_of_value(on_sample, state):

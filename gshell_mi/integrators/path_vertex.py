@@ -81,3 +81,34 @@ def sample_direct(scene, si, bsdf, sample, active, attached, surface_emitters):
         weight *= solid_angle
     value, bsdf_pdf = bsdf.eval_pdf(context, si, si.to_local(ds.d), active)
     return dr.select(active, dr.select(ds.delta, 1, mis_weight(pdf, bsdf_pdf)) * value * weight, 0)
+
+
+def scattering(bsdf, si, d, solid_angle, sample, active, special):
+    """Factor of value 1 with the derivative of scattering towards a point.
+
+    Where light just passes through (``mask``), of the transmission; the geometry of such a
+    segment is that of the surfaces at its ends and is left out.
+    """
+    change = dr.relative_grad(bsdf.eval(mi.BSDFContext(), si, si.to_local(d), active)) * solid_angle
+    if not special:
+        return change
+    passes = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
+    return dr.select(passes, dr.relative_grad(bsdf.eval_null_transmission(si, active)), change)
+
+
+def delta_lobe(bsdf, si, ray, ray_next, choice, sample2, delta, active, kind, change):
+    """Direction, and relative weight and coverage, where the first surface scatters in one direction.
+
+    A mirrored or refracted direction follows the surface, and one that passes through (``mask``)
+    the camera ray; the chance to pass is the opacity's complement.
+    """
+    context = mi.BSDFContext()
+    passes = active & mi.has_flag(kind, mi.BSDFFlags.Null)
+    sample, weight = bsdf.sample(context, si, choice, sample2, active)
+    transmission = bsdf.eval_null_transmission(si, active)
+    d = dr.select(passes, ray.d, dr.select(delta, si.to_world(sample.wo), ray_next.d))
+    change = dr.select(passes, dr.relative_grad(transmission),
+                       dr.select(delta, dr.relative_grad(weight), change))
+    opacity = 1 - dr.mean(mi.unpolarized_spectrum(transmission))
+    seen = dr.select(passes, dr.relative_grad(1 - opacity), dr.relative_grad(opacity))
+    return d, change, dr.select(active, seen, 1)

@@ -20,17 +20,15 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .edge_wedges import build_edge_wedges, silhouette_for
+from .edge_wedges import build_edge_wedges
 from .reparameterised_film import film_channels
 from .resampling import systematic_counts
+from .shadow_curves import ShadowCurves
 from .shadow_edges import draw_directions, draw_emitters, draw_map_directions
 from .silhouette_edges import project_to_film
 
 #: Points tried per point used
 CANDIDATES = 4
-
-#: Share of the points that are tried as the place where a mesh turns away from the light
-_TURNING = 0.2
 
 #: Light that surfaces send, for the importance of points that no emitter reaches, in units of the mean
 _INDIRECT = 0.2
@@ -96,8 +94,7 @@ class _Boundary:
 
     def __init__(self, integrator, scene, sensor, wedges):
         self.integrator, self.scene, self.sensor, self.wedges = integrator, scene, sensor, wedges
-        self.to_camera = dr.detach(sensor.world_transform()).inverse()
-        self.viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
+        self.curves = ShadowCurves(scene, sensor, wedges)
         film = sensor.film()
         self.border = film.rfilter().border_size() if film.sample_border() else 0
 
@@ -117,11 +114,11 @@ class _Boundary:
         dr.eval(drawn.arrays(), cast, outward)
 
         with dr.resume_grad():
-            followed = self._follow(self.wedges.positions, drawn, cast, outward, bounce)
+            followed = self.curves.follow(self.wedges.positions, drawn, cast, outward, bounce)
             moving = project_to_film(self.sensor, followed.visible)
-        tangent, _, side = self._film_vectors(followed)
+        tangent, _, side = self.curves.film_vectors(followed)
         scattered, radiance, ok = self._reflected(drawn, cast, followed, bounce)
-        lit, dark = self._rays(drawn, cast, followed, outward)
+        lit, dark = self.curves.rays(drawn, cast, followed, outward)
         if indirect:
             lit, dark = (self.integrator.primal(self.scene, self._path_sampler(sampler, drawn), ray, ok,
                                                 start=1).value for ray in (lit, dark))
@@ -141,109 +138,24 @@ class _Boundary:
 
     def _importance(self, drawn, bounce, indirect):
         """Which points are those of cast shadows, the way out of each edge's wedge, and how many to use."""
-        cast, outward, valid = self._place(drawn)
-        followed = self._follow(dr.detach(self.wedges.positions), drawn, cast, outward, bounce)
+        cast, outward, valid = self.curves.place(drawn)
+        followed = self.curves.follow(dr.detach(self.wedges.positions), drawn, cast, outward, bounce)
         c = project_to_film(self.sensor, followed.visible)
         size = mi.Point2f(self.sensor.film().crop_size())
         ok = valid & followed.valid & dr.all((c > -self.border) & (c < size + self.border))
-        followed.valid = ok & ((self.to_camera @ followed.visible).z > self.sensor.near_clip())
+        followed.valid = ok & ((self.curves.to_camera @ followed.visible).z > self.sensor.near_clip())
         scattered, radiance, ok = self._reflected(drawn, cast, followed, bounce)
-        lit, _ = self._rays(drawn, cast, followed, outward)
+        lit, _ = self.curves.rays(drawn, cast, followed, outward)
         radiance = dr.select(ok & self._reaches(drawn, lit, followed.lit), radiance, 0)
         if indirect:
             radiance = dr.mean(mi.unpolarized_spectrum(radiance))
             mean = dr.mean(radiance)
             radiance = mi.Spectrum(radiance + dr.select(mean > 0, _INDIRECT * mean, 1))
-        _, area, _ = self._film_vectors(followed)
+        _, area, _ = self.curves.film_vectors(followed)
         value = dr.mean(mi.unpolarized_spectrum(scattered * radiance))
         importance = dr.select(ok, drawn.weight * area * value, 0)
         dr.eval(cast, outward, importance, drawn.weight)
         return cast, outward, importance
-
-    def _place(self, drawn):
-        """Decides for each point whether it is to cast a shadow, and corrects the weights for that.
-
-        The other points are those where the visible side of a mesh turns away from the light: shading
-        normals do so elsewhere, so the light jumps at the edge. Not so where the film warp follows it.
-        """
-        p, q, axis, inward, across = self.wedges.frame(drawn.edge)
-        low, high = dr.gather(mi.Float, self.wedges.low, drawn.edge), dr.gather(mi.Float, self.wedges.high,
-                                                                                drawn.edge)
-        y = dr.lerp(p, q, drawn.t)
-        towards = drawn.towards(y)
-        middle = 0.5 * (low + high)
-        outward = dr.normalize(dr.cross(axis, towards))
-        outward *= -dr.sign(dr.dot(outward, inward * dr.cos(middle) + across * dr.sin(middle)))
-        seen_as_silhouette = silhouette_for(self.viewpoint - y, inward, across, low, high)
-        can_turn = ~seen_as_silhouette & ~dr.gather(mi.Bool, self.wedges.crease, drawn.edge)
-        cast = ~can_turn | (drawn.kind >= _TURNING)
-        share = dr.select(can_turn, dr.select(cast, 1 - _TURNING, _TURNING), mi.Float(1))
-        drawn.weight = drawn.weight / share
-        valid = dr.isfinite(dr.squared_norm(outward)) & (drawn.weight > 0)
-        lift = 4e-5 * (1 + dr.max(dr.abs(y)))
-        return cast, mi.Vector3f(outward * lift), valid
-
-    def _follow(self, positions, drawn, cast, outward, bounce):
-        """From points on edges to what a camera may see of their shadow."""
-        wedges = self.wedges
-        a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, x, drawn.edge))
-                for x in (wedges.start, wedges.end))
-        y = mi.Point3f(dr.lerp(a, b, drawn.t)) + outward
-        towards = drawn.towards(y)
-        shadow, normal, valid = self._next_surface(y, -towards, 0, cast)
-        with dr.suspend_grad():
-            y_now, along, across = dr.detach(y), dr.detach(b - a), dr.normalize(outward)
-            now = dr.detach(towards)
-            scale = mi.Float(1)
-            if drawn.is_point:
-                z = mi.Point3f(drawn.position)
-                scale = dr.norm(dr.detach(shadow) - z) / dr.norm(y_now - z)
-            along = dr.select(cast, _slide(along, normal, now) * scale, along)
-            across = dr.select(cast, _slide(across, normal, now) * scale, self._lit_side(drawn, now))
-        p = dr.select(cast, shadow, y)
-        lit, valid = dr.detach(p), valid | ~cast
-        via = None
-        if bounce:
-            via = mi.warp.square_to_uniform_sphere(drawn.via)
-            p, normal, hit = self._next_surface(p, -via, 1e-4 * (1 + dr.max(dr.abs(lit))), valid)
-            along, across = (_slide(x, normal, via) for x in (along, across))
-            valid &= hit
-        return _Followed(mi.Point3f(p), mi.Point3f(lit), y_now, along, across, valid, via)
-
-    def _lit_side(self, drawn, towards):
-        """Unit vectors from edges into the face that is turned to the light."""
-        _, _, _, inward, across = self.wedges.frame(drawn.edge)
-        high = dr.gather(mi.Float, self.wedges.high, drawn.edge)
-        outer = across * dr.cos(high) - inward * dr.sin(high)
-        angle = dr.select(dr.dot(outer, towards) > 0, high, dr.gather(mi.Float, self.wedges.low, drawn.edge))
-        return inward * dr.cos(angle) + across * dr.sin(angle)
-
-    def _next_surface(self, p, direction, lift, active):
-        """The next surface from points along a direction: position, attached; normal; whether any."""
-        ray = mi.Ray3f(mi.Point3f(p + direction * lift), direction)
-        with dr.suspend_grad():
-            pi = self.scene.ray_intersect_preliminary(dr.detach(ray), active=active)
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
-        return mi.Point3f(si.p), dr.detach(si.n), pi.is_valid() & active
-
-    def _film_vectors(self, followed):
-        """Derivative of the film position along the edge; the film area that a unit motion across it
-        sweeps; and the sign of the side on which there is light."""
-        p = mi.Point3f(dr.detach(followed.visible))
-        tangent, across = (self._on_film(p, x) for x in (followed.along, followed.across))
-        cross = tangent.x * across.y - tangent.y * across.x
-        area = dr.abs(cross)
-        return tangent, dr.select(dr.isfinite(area), area, 0), dr.sign(cross)
-
-    def _on_film(self, p, direction):
-        """Derivative of the film position of points along a direction."""
-        distance, length = dr.norm(p - self.viewpoint), dr.norm(direction)
-        step = 1e-2 * distance / dr.maximum(length, 1e-20)
-        moved = mi.Point3f(p + direction * step)
-        # A straight line stays one, so only the scale of a finite step needs mending.
-        scale = (self.to_camera @ moved).z / (self.to_camera @ p).z
-        offset = project_to_film(self.sensor, moved) - project_to_film(self.sensor, p)
-        return mi.Vector2f(offset) * (scale / step)
 
     def _reflected(self, drawn, cast, followed, bounce):
         """What the camera sees per light at the boundary; the emitter's light; whether it is seen at all."""
@@ -253,7 +165,7 @@ class _Boundary:
             visible = dr.select(cast, visible, visible + 1e-2 * dr.norm(followed.along) * followed.across)
         u = project_to_film(self.sensor, visible) / mi.Vector2f(film.crop_size())
         ray, throughput = self.sensor.sample_ray(self.sensor.shutter_open(), 0.0, u, mi.Point2f(0.5))
-        si = self.integrator._first_hit(self.scene, ray, followed.valid).compute_surface_interaction(
+        si = self.integrator.first_hit(self.scene, ray, followed.valid).compute_surface_interaction(
             ray, mi.RayFlags.All, followed.valid)
         ok = followed.valid & si.is_valid() & (dr.norm(si.p - visible) < tolerance * si.t)
         context = mi.BSDFContext()
@@ -291,34 +203,9 @@ class _Boundary:
             geometry = dr.abs_dot(ds.n, ds.d) / dr.square(ds.dist)
         return direction, drawn.emitter.eval_direction(si, ds, active) * geometry
 
-    def _rays(self, drawn, cast, followed, outward):
-        """Rays towards the light that pass by the edge, and that its wedge stops."""
-        lit = mi.Ray3f(followed.y, drawn.towards(followed.y))
-        inside = followed.y - 2 * outward
-        origin = dr.select(cast, followed.lit, inside)
-        direction = dr.select(cast, dr.normalize(inside - followed.lit), drawn.towards(inside))
-        origin += direction * dr.select(cast, 1e-4 * (1 + dr.max(dr.abs(origin))), 0)
-        return lit, mi.Ray3f(mi.Point3f(origin), direction)
-
     def _reaches(self, drawn, ray, lit):
         """Whether rays meet nothing on their way to the light."""
         ray = mi.Ray3f(ray)
         if drawn.is_point:
             ray.maxt = dr.norm(mi.Point3f(drawn.position) - ray.o) * (1 - 1e-3)
         return ~self.scene.ray_test(ray)
-
-
-@dataclass
-class _Followed:
-    visible: object     #: ``Point3f``, attached: what a camera may see
-    lit: object         #: ``Point3f``: where the light arrives
-    y: object           #: ``Point3f``: the point beside the edge
-    along: object       #: ``Vector3f``: derivative of ``visible`` along the edge
-    across: object      #: ``Vector3f``: derivative of ``visible`` for a unit motion towards the light
-    valid: object       #: ``Bool``
-    via: object         #: ``Vector3f``: direction from ``visible`` to ``lit`` if these differ
-
-
-def _slide(vector, normal, along):
-    """The vector projected along a direction on the plane with the given normal."""
-    return vector - along * (dr.dot(normal, vector) / dr.dot(normal, along))

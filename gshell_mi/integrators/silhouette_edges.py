@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .edge_table import SIZE_INDEPENDENT
+from .edge_table import SIZE_INDEPENDENT, join
+from .resampling import expand
 from .shading_rims import shading_rims
 
 
@@ -83,12 +84,6 @@ def _clip(lo, hi, inside_a, inside_b):
     return lo, dr.select((inside_a < 0) & (inside_b < 0), -1, hi)
 
 
-def _project(sensor, p):
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p = p
-    return mi.Point2f(sensor.sample_direction(it, mi.Point2f(0.5))[0].uv)
-
-
 def _compact(selected, *arrays):
     index = dr.compress(selected)
     return [dr.gather(type(x), x, index) for x in arrays]
@@ -123,15 +118,9 @@ def _mesh_pieces(mesh, table, sensor, crease_angle, margin, piece_length, to_cam
     if dr.width(start) == 0:
         return None
 
-    # One entry per piece: mark where the pieces of each edge begin, then count the marks.
-    first = dr.prefix_sum(count)
-    total = dr.sum(count)[0]
-    mark = dr.zeros(mi.UInt32, total)
-    dr.scatter(mark, mi.UInt32(1), first, mode=dr.ReduceMode.Permute)
-    edge = dr.cumsum(mark) - 1
-    number = mi.Float(dr.arange(mi.UInt32, total) - dr.gather(mi.UInt32, first, edge))
+    edge, number, _ = expand(count)
+    number = mi.Float(number)
     step = dr.rcp(mi.Float(dr.gather(mi.UInt32, count, edge)))
-    dr.eval(edge)
     start, end, s0, s1, t0, t1, zp, zq = (
         dr.gather(type(x), x, edge) for x in (start, end, s0, s1, t0, t1, zp, zq))
 
@@ -199,7 +188,7 @@ def _visible_rims(scene, sensor, a, b, margin, to_camera, near, cull):
                      for points in (a, b))
 
 
-def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True, crease_angle=10.0):
+def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True, crease_angle=0.1):
     """All silhouettes and shading rims of the scene's meshes, projected and cut into short pieces.
 
     Parameters
@@ -236,18 +225,4 @@ def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True, 
     if not parts:
         return None
     with dr.resume_grad():
-        return ScreenEdges(*(_concatenate([part[k] for part in parts]) for k in range(2)))
-
-
-def _concatenate(arrays):
-    """``dr.concat`` bakes the sizes into the kernel; scattering does not."""
-    if len(arrays) == 1:
-        return arrays[0]
-    result = dr.zeros(mi.Point2f, sum(dr.width(x) for x in arrays))
-    offset = 0
-    for x in arrays:
-        index = dr.arange(mi.UInt32, dr.width(x)) + dr.opaque(mi.UInt32, offset)
-        for k in range(2):
-            dr.scatter(result[k], x[k], index, mode=dr.ReduceMode.Permute)
-        offset += dr.width(x)
-    return result
+        return ScreenEdges(*(join([part[k] for part in parts]) for k in range(2)))

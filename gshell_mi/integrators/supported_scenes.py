@@ -1,10 +1,21 @@
-"""Says once which parts of a scene the integrators cannot differentiate correctly."""
+"""What a scene contains, and which parts of it the integrators cannot differentiate correctly."""
 
 import warnings
 
 import mitsuba as mi
 
 from ..errors import UserError
+
+
+def has_surface_emitters(scene):
+    """Whether the scene has any area light."""
+    return any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in scene.emitters())
+
+
+def has_bsdf_flag(scene, flag):
+    """Whether any surface has a BSDF with the given ``BSDFFlags``."""
+    return any(shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), flag)
+               for shape in scene.shapes())
 
 
 def check_sensor(sensor):
