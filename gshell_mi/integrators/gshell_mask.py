@@ -6,6 +6,7 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from . import reparameterised_film
 from .path_sample import PathSample
+from .supported_scenes import check_meshes
 
 
 class GShellMaskIntegrator(ADIntegrator):
@@ -36,6 +37,7 @@ class GShellMaskIntegrator(ADIntegrator):
         return ["depth", "normal.x", "normal.y", "normal.z"]
 
     def sample(self, mode, scene, sampler, ray, active=True, **kwargs):
+        check_meshes(scene)
         result = self.primal(scene, sampler, ray, active)
         return result.value, result.alpha > 0.5, result.aovs, None
 

@@ -10,7 +10,7 @@ from . import reparameterised_film, shadow_boundary
 from .path_replay import replay
 from .path_sample import PathSample
 from .path_vertex import delta_lobe, material_point, mis_weight, sample_direct, scattering, segment
-from .supported_scenes import has_bsdf_flag, has_surface_emitters
+from .supported_scenes import check_meshes, has_bsdf_flag, has_surface_emitters
 
 
 class GShellPathIntegrator(ADIntegrator):
@@ -60,6 +60,7 @@ class GShellPathIntegrator(ADIntegrator):
     # ------------------------------------------------------------------ rendering
 
     def sample(self, mode, scene, sampler, ray, active=True, **kwargs):
+        check_meshes(scene)
         result = self.primal(scene, sampler, mi.Ray3f(ray), active)
         return result.value, result.alpha > 0.5, result.aovs, None
 

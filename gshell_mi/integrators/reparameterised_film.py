@@ -15,7 +15,7 @@ from .edge_table import scene_edge_tables
 from .film_splat import FilmSplat
 from .pixel_borders import PixelBorders
 from .silhouette_edges import screen_edges
-from .supported_scenes import check_sensor, warn_once
+from .supported_scenes import check_meshes, check_sensor, warn_once
 from .warp import EdgeGrid, FilmWarp, fixed_line_weight
 
 
@@ -163,6 +163,7 @@ def _prepare(integrator, scene, sensor, seed, spp):
     if isinstance(sensor, int):
         sensor = scene.sensors()[sensor]
     check_sensor(sensor)
+    check_meshes(scene)
     warn_once(scene, integrator.said)
     sampler, spp = integrator.prepare(sensor, seed, spp, integrator.aov_names())
     samples = CameraSamples.draw(sensor, sampler)

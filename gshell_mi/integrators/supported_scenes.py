@@ -29,18 +29,26 @@ def check_sensor(sensor):
                         "and gshell_mask cannot differentiate; use 'hdrfilm'.")
 
 
+def check_meshes(scene):
+    """Raises for meshes without faces, from whose empty buffers Mitsuba cannot read."""
+    for shape in scene.shapes():
+        if shape.is_mesh() and shape.face_count() == 0:
+            raise UserError(f"Mesh '{shape.id()}' has no face, which Mitsuba cannot render; leave it out, or "
+                            "give it a face whose three corners are the same.")
+
+
 def unsupported(scene):
     """Sentences about what the derivatives of this scene leave out.
 
     >>> scene = mi.load_dict({'type': 'scene', 'ball': {'type': 'sphere', 'id': 'ball'}})
     >>> unsupported(scene)
-    ["Shape 'ball' is a Sphere: silhouettes are found for triangle meshes only."]
+    ["Shape 'ball' (Sphere) is no triangle mesh: its silhouettes have no derivative."]
     """
     sentences = []
     for shape in scene.shapes():
         if not shape.is_mesh():
-            sentences.append(f"Shape '{shape.id()}' is a {shape.class_name()}: silhouettes are found for "
-                             "triangle meshes only.")
+            sentences.append(f"Shape '{shape.id()}' ({shape.class_name()}) is no triangle mesh: its "
+                             "silhouettes have no derivative.")
         bsdf = shape.bsdf()
         if bsdf is not None and any(mi.has_flag(bsdf.flags(), flag) for flag in
                                     (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)):

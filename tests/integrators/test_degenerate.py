@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from gshell_mi.errors import UserError
 from pipelines import gradient_scenes as scenes
 
 
@@ -39,8 +40,23 @@ MESHES = {
 
 
 @pytest.mark.parametrize("kind", ["gshell_path", "gshell_mask"])
+def test_mesh_without_faces_is_an_error_that_names_it(kind):
+    """Mitsuba itself fails at such a mesh ("attempted to gather from an empty array")."""
+    scene = scenes.load(scenes.camera(8), scenes.constant(), mi.Mesh("nothing", 3, 0))
+    integrator = make_integrator(kind)
+    with pytest.raises(UserError, match="has no face"):
+        integrator.render_forward(scene, None, 0)
+    with pytest.raises(Exception, match=r"drjit\.custom") as caught:
+        mi.render(scene, integrator=integrator, spp=1)
+    causes = [caught.value]
+    while causes[-1].__cause__ is not None:
+        causes.append(causes[-1].__cause__)
+    assert isinstance(causes[-1], UserError)
+
+
+@pytest.mark.parametrize("kind", ["gshell_path", "gshell_mask"])
 def test_empty_mesh_beside_another_changes_nothing(kind):
-    """Mitsuba cannot render a mesh of no faces at all; an empty one has a face without extent."""
+    """An empty mesh has a face without extent."""
     v, f = scenes.sphere(1, 0.7)
     empty = scenes.make_mesh("empty", np.zeros((3, 3)), np.zeros((1, 3), int))
     integrator = make_integrator(kind)

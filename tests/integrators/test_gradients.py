@@ -256,17 +256,41 @@ def test_reparam_depth_is_checked():
         mi.load_dict({"type": "gshell_path", "reparam_depth": 7})
 
 
-def test_warns_once_of_what_it_cannot_differentiate():
-    v, f = scenes.sphere(1)
-    glass = {"type": "sphere", "id": "ball", "center": [1, 0, 0], "radius": 0.3,
-             "bsdf": {"type": "dielectric"}}
-    scene = scenes.load(scenes.camera(8), scenes.constant(), scenes.make_mesh("subject", v, f), ball=glass)
+def odd_shapes(folder):
+    """Kind -> shapes that the integrators cannot differentiate, and words of the warnings about them."""
+    curve = folder / "curve.txt"
+    curve.write_text("".join(f"{x} {0.3 * x} 0.5 0.05\n" for x in (-1.5, -0.7, 0, 0.7, 1.5)))
+    scenes.make_mesh("ball", *scenes.sphere(1, 0.3)).write_ply(str(folder / "ball.ply"))
+    ball = {"type": "ply", "filename": str(folder / "ball.ply")}
+    instance = {"type": "instance", "id": "odd", "to_world": mi.ScalarTransform4f().translate([1, 0, 0]),
+                "shape": {"type": "ref", "id": "group"}}
+    glass = {"type": "sphere", "id": "odd", "radius": 0.3, "bsdf": {"type": "dielectric"}}
+    v, f = scenes.sheet(2)
+    return {
+        "curve": ({"odd": {"type": "bsplinecurve", "id": "odd", "filename": str(curve)}}, ["BSplineCurve"]),
+        "instance": ({"group": {"type": "shapegroup", "id": "group", "ball": ball}, "odd": instance},
+                     ["Instance"]),
+        "glass": ({"odd": glass}, ["Sphere", "mirror or glass"]),
+        "mirror": ({"odd": scenes.make_mesh("odd", v, f, {"type": "conductor"})}, ["mirror or glass"]),
+        "mask": ({"odd": scenes.make_mesh("odd", v, f, {"type": "mask", "opacity": 0.5,
+                                                        "bsdf": scenes.diffuse()})}, ["partly transparent"]),
+    }
+
+
+@pytest.mark.parametrize("kind", ["curve", "instance", "glass", "mirror", "mask"])
+def test_says_once_what_it_cannot_differentiate(kind, tmp_path):
+    others, words = odd_shapes(tmp_path)[kind]
+    v, f = scenes.sphere(1, 0.7)
+    scene = scenes.load(scenes.camera(8), scenes.constant(), scenes.make_mesh("subject", v, f), **others)
     params = mi.traverse(scene)
-    dr.enable_grad(params["subject.vertex_positions"])
+    key = "subject.vertex_positions"
+    dr.enable_grad(params[key])
     params.update()
-    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 3})
-    with pytest.warns(RuntimeWarning) as caught:
+    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 4, "reparam_depth": 2})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         for seed in range(2):
             dr.backward(dr.sum(mi.render(scene, params, integrator=integrator, spp=4, seed=seed)))
-    messages = sorted(str(w.message) for w in caught if "ball" in str(w.message))
-    assert len(messages) == 2 and "Sphere" in messages[0] and "mirror or glass" in messages[1]
+    messages = sorted(str(w.message) for w in caught if "'odd'" in str(w.message))
+    assert len(messages) == len(words) and all(w in m for w, m in zip(words, messages, strict=True))
+    assert np.isfinite(np.array(dr.grad(params[key]))).all()
