@@ -85,7 +85,7 @@ def test_length_of_a_projected_circle():
     tangent = 1 / np.sqrt(5**2 - 1)     # of half the angle under which the sphere is seen
     circumference = 2 * np.pi * tangent * 32 / np.tan(np.deg2rad(20))
     # The silhouette of a polyhedron is a zigzag near that circle.
-    assert projected_length(scene) == pytest.approx(circumference, rel=0.1)
+    assert projected_length(scene, crease_angle=30) == pytest.approx(circumference, rel=0.1)
 
 
 def test_shading_rim_lies_inside_the_silhouette_and_where_normals_are_at_right_angles():
