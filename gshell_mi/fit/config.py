@@ -94,6 +94,9 @@ class FitConfig:
     Where radiance depends much on the view (gloss), it may explain the views it sees by a wrong shape."""
 
     # --- joint stage: geometry, material and light by path tracing
+    field: Literal["explicit", "multiresolution", "hashgrid", "sinusoidal"] = "explicit"
+    """What the geometry is optimised as: the lattice's values themselves, sums of grids of several
+    resolutions, a hash grid with a small network, or a sinusoidal network."""
     iterations: int = 200
     """Steps of the joint stage."""
     warmup: float = 0.15

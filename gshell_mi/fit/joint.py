@@ -10,6 +10,7 @@ from .. import losses
 from ..fields.smoothing import LatticeDiffusion
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, principled
+from ..parametrisation import StepRules, make_parametrisation
 from ..scene import FitScene
 from ..timing import phase
 from .config import FitConfig
@@ -18,7 +19,7 @@ from .regularisers import Regularisers
 
 
 class JointStage:
-    """Adam on the lattice fields, the material and the environment map.
+    """Adam on what parametrises the lattice fields, the material and the environment map.
 
     The subject's shape holds the starting geometry. For the first part of the stage only material and
     light move: geometry gradients mean nothing while the shading is wrong. If both are given, there is no
@@ -47,13 +48,14 @@ class JointStage:
         self._integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
                                          "reparam_depth": config.reparam_depth, "hide_emitters": True})
         self._diffuse = LatticeDiffusion(self.subject.lattice.stride)
-        # One step size for the whole surface: normalising each vertex on its own would undo the smoothing
-        # and let noise move the vertices that few pixels see as far as all others.
-        self.geometry = mi.ad.Adam(lr=config.geometry_lr, uniform=True)
-        self._moving = [name for name in self.subject.field_names
-                        if name != "msdf" or not config.watertight]
-        for name in self._moving:
-            self.geometry[name] = mi.Float(self.parameters[f"subject.{name}"])
+        moving = [name for name in self.subject.field_names if name != "msdf" or not config.watertight]
+        start = {name: self.parameters[f"subject.{name}"] for name in moving}
+        rules = StepRules(config.geometry_lr, config.deform_lr, config.geometry_smoothing,
+                          config.geometry_detail)
+        self.geometry = make_parametrisation(config.field, start, self.subject.lattice, rules,
+                                             seed=config.seed)
+        #: The lattice fields of the present step, with gradients enabled; none before the geometry moves.
+        self.fields: dict[str, mi.Float] = {}
         self.shading = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
         if light:
             self.shading["light"] = light.log_radiance
@@ -62,7 +64,7 @@ class JointStage:
 
     @property
     def optimizers(self) -> dict[str, mi.ad.Adam]:
-        return {"geometry": self.geometry, "shading": self.shading}
+        return self.geometry.optimizers | {"shading": self.shading}
 
     def step(self, iteration: int) -> dict[str, float]:
         """One step on one view; returns the losses."""
@@ -83,15 +85,13 @@ class JointStage:
         total = color + config.joint_mask * mask + regularisation
         with phase("backward") as compute:
             dr.backward(total)
-            compute(*(dr.grad(value) for optimizer in (self.geometry, self.shading)
-                      for value in optimizer.values()))
+            compute(*(dr.grad(value) for value in (*self.fields.values(), *self.shading.values())))
         progress = iteration / max(config.iterations, 1)
-        decay = 0.1**progress
         with phase("optimiser"):
             if moving:
-                ratio = config.geometry_detail / config.geometry_smoothing
-                self._step_geometry(decay, config.geometry_smoothing * ratio**progress)
-            self._step_shading(decay)
+                gradients = {name: dr.grad(field) for name, field in self.fields.items()}
+                self.geometry.step(gradients, progress, iteration)
+            self._step_shading(0.1**progress)
         error = dr.mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]), axis=None)
         return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
                 **{name: value[0] for name, value in terms.items()},
@@ -117,10 +117,12 @@ class JointStage:
         return int(order[iteration % count])
 
     def _apply(self, *, geometry: bool) -> None:
-        """Puts the optimisers' parameters into the scene, attached."""
+        """Puts the optimised fields into the scene, with gradients enabled."""
         if geometry:
-            for name in self._moving:
-                self.parameters[f"subject.{name}"] = self.geometry[name]
+            self.fields = self.geometry.fields()
+            dr.enable_grad(self.fields)
+            for name, field in self.fields.items():
+                self.parameters[f"subject.{name}"] = field
         self.material.parameters = {name: self.shading[name] for name in self.material.parameters}
         for name, field in self.material.values().items():
             self.parameters[f"subject.lattice_{name}"] = field
@@ -128,23 +130,6 @@ class JointStage:
             self.light.log_radiance = self.shading["light"]
             self.light.update(self.parameters)
         self.parameters.update()
-
-    def _step_geometry(self, decay: float, smoothing: float) -> None:
-        optimizer, config = self.geometry, self.config
-        cell = self.subject.lattice.spacing
-        for name in self._moving:
-            gradient = dr.grad(optimizer[name])
-            gradient = dr.select(dr.isfinite(gradient), gradient, 0)
-            # The weights of FlexiCubes belong to cubes, one by one.
-            if name != "weights":
-                gradient = self._diffuse(gradient, smoothing)
-            dr.set_grad(optimizer[name], gradient)
-        rate = decay * config.geometry_lr * cell
-        local = decay * config.deform_lr
-        rates = {"sdf": rate, "msdf": rate, "deform": local, "weights": local}
-        optimizer.set_learning_rate({name: rates[name] for name in self._moving})
-        optimizer.step()
-        optimizer["deform"] = dr.minimum(dr.maximum(optimizer["deform"], -1), 1)
 
     def _step_shading(self, decay: float) -> None:
         config, optimizer = self.config, self.shading

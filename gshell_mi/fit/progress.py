@@ -59,7 +59,8 @@ class Progress:
             mean = sum(durations) / len(durations)
             detail = f"{done}/{total}  {mean:.2f} s/step  {_clock((total - done) * mean)} left"
             if values and "loss" in values:
-                detail = f"loss {values['loss']:.4f}  PSNR {values['psnr']:.1f} dB  " + detail
+                quality = f"  PSNR {values['psnr']:.1f} dB" if "psnr" in values else ""
+                detail = f"loss {values['loss']:.4f}{quality}  {detail}"
             self._bars.update(task, completed=done, detail=detail)
 
         try:

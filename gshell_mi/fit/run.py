@@ -32,6 +32,7 @@ from ..views import PinholeViews
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
 from .config import FitConfig, default_output
 from .depth import check_depth
+from .field_fitting import FieldFitting
 from .findings import findings
 from .interrupt import Interrupt
 from .joint import JointStage
@@ -54,7 +55,7 @@ _HOLD_OUT = 8
 #: Parts of the refinement's displacement that are tried until one does not tear the surface.
 _FRACTIONS = (1.0, 0.8, 0.6, 0.4, 0.2)
 
-STAGES = ("hull", "ghost", "refinement", "joint", "done")
+STAGES = ("hull", "ghost", "refinement", "field", "joint", "done")
 
 
 @dataclass(frozen=True)
@@ -313,6 +314,7 @@ class _Fit:
         self.scene.subject.set_fields(start_fields(start, self.lattice.grid))
         joint = JointStage(self.scene, start_material(self.scene, start, self.config),
                            start_light(self.scene, start, self.config), self.config)
+        self._fit_field(joint)
         if self.checkpoint.stage == "joint":
             self._iterate("joint", self.config.iterations, joint, joint.optimizers, start)
         else:
@@ -329,6 +331,23 @@ class _Fit:
         metrics = metrics | {name: round(size / 2**20) for name, size in mib.items()}
         return write_metrics(self.output, metrics, self.checkpoint.seconds)
 
+    def _fit_field(self, joint: JointStage) -> None:
+        """Brings what parametrises the geometry to where the joint stage starts."""
+        state, geometry = self.checkpoint, joint.geometry
+        fitted = geometry.fitting_steps == 0 or any(name.startswith("geometry/") for name in state.arrays)
+        if state.stage == "joint" and not fitted:
+            self._enter("field", **state.arrays)
+        if state.stage == "field":
+            start = {name: array for name, array in state.arrays.items() if "/" not in name}
+            self._iterate("field", geometry.fitting_steps, FieldFitting(joint), geometry.optimizers, start)
+            geometry.begin()
+            for name, optimizer in geometry.optimizers.items():
+                start |= optimizer_arrays(name, optimizer)
+            self._enter("joint", **start)
+        elif state.stage == "joint" and state.iteration == 0 and geometry.fitting_steps:
+            for name, optimizer in geometry.optimizers.items():
+                restore_optimizer(name, optimizer, state.arrays)
+
     def _write_documents(self) -> None:
         """The asset and the report; for want of them a fit is not lost."""
         try:
@@ -341,7 +360,8 @@ class _Fit:
 
     # --- bookkeeping
 
-    def _iterate(self, stage: str, count: int, worker: RadianceGhost | PhotometricRefinement | JointStage,
+    def _iterate(self, stage: str, count: int,
+                 worker: RadianceGhost | PhotometricRefinement | FieldFitting | JointStage,
                  optimizers: Mapping[str, mi.ad.Adam], constants: dict[str, np.ndarray]) -> None:
         """Runs the steps of a stage that are left, logging each and saving a checkpoint now and then."""
         first = self.checkpoint.iteration

@@ -139,7 +139,7 @@ def test_the_derivative_moves_the_surface_towards_the_map(scene):
     joint = stage(fit, RADIUS - 0.05)
     joint._apply(geometry=True)
     dr.backward(joint._regularisers(8)[1]["joint_depth"])
-    assert -dr.sum(dr.grad(joint.geometry["sdf"]))[0] == pytest.approx(-10, rel=0.03)
+    assert -dr.sum(dr.grad(joint.fields["sdf"]))[0] == pytest.approx(-10, rel=0.03)
 
 
 def test_depth_is_measured_at_the_end(scene, tmp_path):

@@ -39,14 +39,12 @@ def stage(fit, *, top: float = 0.0, radius: float = RADIUS, noise: float = 0.0, 
 
 
 def gradients(joint: JointStage, view: int = 0) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-    """The terms of a view, and the derivative of their weighted sum with respect to every parameter."""
+    """The terms of a view, and the derivative of their weighted sum with respect to fields and shading."""
     joint._apply(geometry=True)
     total, terms = joint._regularisers(view)
     dr.backward(total, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-    found = {}
-    for optimizer in joint.optimizers.values():
-        for name in list(optimizer.keys()):
-            found[name] = np.array(dr.grad(optimizer[name])).ravel()
+    values = (*joint.fields.items(), *joint.shading.items())
+    found = {name: np.array(dr.grad(value)).ravel() for name, value in values}
     return {name: float(value[0]) for name, value in terms.items()}, found
 
 
@@ -128,7 +126,8 @@ def test_template_smoothness_smooths(fit):
     smooth, _ = gradients(stage(fit, template_smoothness=1.0))
     assert rough["template_smoothness"] > 2 * smooth["template_smoothness"]
     step = 0.02 * found["sdf"] / np.abs(found["sdf"]).max()
-    joint.geometry["sdf"] = joint.geometry["sdf"] - mi.Float(step.astype(np.float32))
+    geometry = joint.geometry.optimizer
+    geometry["sdf"] = geometry["sdf"] - mi.Float(step.astype(np.float32))
     after, _ = gradients(joint)
     assert after["template_smoothness"] < rough["template_smoothness"]
 

@@ -1,0 +1,54 @@
+"""The fields themselves as parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import drjit as dr
+import mitsuba as mi
+
+from ..fields.smoothing import LatticeDiffusion
+from ..lattice import Lattice
+from .parametrisation import CHANNELS, Parametrisation, StepRules, finite
+
+
+class ExplicitGrid(Parametrisation):
+    """One parameter per value of a field (``explicit``).
+
+    The gradient is smoothed on the lattice (a Sobolev gradient: a step changes a region, not a vertex), and
+    Adam takes one step size for the whole of a field: normalising each vertex on its own would undo the
+    smoothing and let noise move the vertices that few pixels see as far as all others.
+
+    Args:
+        start: fields to start from, any of ``sdf``, ``msdf``, ``deform``, ``weights``.
+    """
+
+    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice, rules: StepRules):
+        self.lattice, self.rules = lattice, rules
+        self._diffuse = LatticeDiffusion(lattice.stride)
+        self.optimizer = mi.ad.Adam(lr=rules.rate, uniform=True)
+        for name, field in start.items():
+            self.optimizer[name] = mi.Float(field)
+
+    @property
+    def optimizers(self) -> dict[str, mi.ad.Adam]:
+        return {"geometry": self.optimizer}
+
+    def fields(self) -> dict[str, mi.Float]:
+        return {name: mi.Float(dr.detach(self.optimizer[name])) for name in self.optimizer.keys()}
+
+    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0) -> None:
+        rules, optimizer = self.rules, self.optimizer
+        decay = rules.decay(progress)
+        smoothing = rules.smoothing_at(progress)
+        far, local = decay * rules.rate * self.lattice.spacing, decay * rules.deform_rate
+        rates = {"sdf": far, "msdf": far, "deform": local, "weights": local}
+        for name, gradient in gradients.items():
+            gradient = finite(gradient)
+            if name in CHANNELS:
+                gradient = self._diffuse(gradient, smoothing)
+            dr.set_grad(optimizer[name], gradient)
+        optimizer.set_learning_rate({name: rates[name] for name in gradients})
+        optimizer.step()
+        if "deform" in gradients:
+            optimizer["deform"] = dr.clip(optimizer["deform"], -1, 1)
