@@ -13,11 +13,11 @@ from .config import FitConfig
 # 128 cells, 12 to 100 views and 128 to 800 pixels per side. pipelines/calibrate_memory.py repeats it.
 _PROGRAM = 280 * 2**20  # Python, Mitsuba, LLVM and its kernels
 _ASSET = 350 * 2**20  # baking the textures of mesh.glb
-_PER_PIXEL = 44  # of all targets: NumPy's copy, the pools of the ghost and of the refinement, the joint stage
+_PER_PIXEL = 68  # of all targets: NumPy's copy, the pools of the ghost and of the refinement, outlines
 _PER_VERTEX = 490  # of the lattice: fields and material, their Adam moments and gradients
 _PER_VOTE = 4  # and lattice vertex: what the visual hull keeps per view that has to see daylight
 _PER_SQUARE_CELL = 37_000  # resolution squared, as the surface grows: meshes, edge lists, derivatives
-_PER_SAMPLE = 100  # of a rendered image
+_PER_SAMPLE = 50  # of a rendered image
 
 
 @dataclass(frozen=True)
