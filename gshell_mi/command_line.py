@@ -15,7 +15,7 @@ Arguments = TypeVar("Arguments")
 
 
 def run_command(name: str, description: str, arguments: type[Arguments], work: Callable[[Arguments], None],
-                given: list[str] | None, *,
+                given: list[str] | None, *, default: Arguments | None = None,
                 interrupted: Callable[[Arguments], str] = lambda _: "Interrupted.") -> int:
     """Parses the arguments, sets their Mitsuba variant and does the work.
 
@@ -25,6 +25,8 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
         arguments: a dataclass with a field ``variant``.
         work: what the command does; only now may it import modules that need a variant.
         given: the arguments; None: those of the process.
+        default: values of the fields that are not given, in place of the dataclass's own;
+            ``tyro.MISSING`` where there is none.
         interrupted: what to say after Ctrl-C.
 
     Returns:
@@ -32,7 +34,8 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
     """
     try:
         parsed = tyro.cli(arguments, args=given, prog=f"python -m gshell_mi.{name}", description=description,
-                          config=(tyro.conf.FlagCreatePairsOff,))
+                          config=(tyro.conf.FlagCreatePairsOff,),
+                          **({} if default is None else {"default": default}))
         try:
             ensure_variant(parsed.variant)
             work(parsed)

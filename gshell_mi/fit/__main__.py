@@ -29,6 +29,9 @@ class _Arguments:
     """Continue an interrupted fit in the output folder."""
     overwrite: bool = False
     """Replace an earlier fit in the output folder."""
+    preview: bool = False
+    """A rough result in half a minute: a coarser lattice, fewer steps and samples, no refinement, no mesh.glb
+    or report.html. What else is given on the command line still counts."""
     no_report: bool = False
     """Leave out mesh.glb and report.html, which take some seconds."""
     quiet: bool = False
@@ -42,8 +45,12 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
+    default = None
+    if "--preview" in words:  # other defaults, which the rest of the words are parsed against
+        default = _Arguments(scene=tyro.MISSING, config=FitConfig.preview())
     return run_command("fit", "Reconstruct an open or closed surface, its material and its light.",
-                       _Arguments, _fit, arguments, interrupted=_how_to_continue)
+                       _Arguments, _fit, arguments, default=default, interrupted=_how_to_continue)
 
 
 def _fit(given: _Arguments) -> None:
@@ -57,8 +64,8 @@ def _fit(given: _Arguments) -> None:
             viewer = stack.enter_context(Viewer(given.viewer_port))
             print(f"live view: {viewer.url}", file=sys.stderr)
         result = fit_scene(given.scene, given.output, targets=given.targets, config=given.config,
-                           resume=given.resume, overwrite=given.overwrite, report=not given.no_report,
-                           quiet=given.quiet, observer=viewer)
+                           resume=given.resume, overwrite=given.overwrite,
+                           report=not (given.no_report or given.preview), quiet=given.quiet, observer=viewer)
     counts = result.metrics["counts"]
     print(f"{result.output}: {counts['vertices']} vertices, {counts['faces']} faces, "
           f"{counts['boundary_loops']} boundary loops, {counts['components']} components, "

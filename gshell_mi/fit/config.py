@@ -14,6 +14,10 @@ WEIGHTS = ("ghost_mask", "ghost_daylight", "ghost_binary", "ghost_closing", "gho
            "eikonal", "template_smoothness", "material_smoothness", "albedo_chroma", "light_smoothness",
            "light_grey", "flexicubes_deviation")
 
+#: What ``--preview`` saves time with.
+_PREVIEW = {"resolution": 48, "ghost_batch": 16384, "refinement_iterations": 0, "iterations": 25, "spp": 4,
+            "primal_spp": 4, "max_depth": 2, "light_height": 16, "triptychs": 4}
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -158,6 +162,15 @@ class FitConfig:
     """Weight of the grey-world prior of the light."""
     flexicubes_deviation: float = 0.01
     """Weight of the FlexiCubes regulariser, in cells; only used with that grid."""
+
+    @classmethod
+    def preview(cls, **others) -> FitConfig:
+        """The settings of ``--preview``, a rough result in half a minute; ``others`` replace some of them.
+
+        >>> FitConfig.preview(iterations=3).iterations, FitConfig.preview().refinement_iterations
+        (3, 0)
+        """
+        return cls(**_PREVIEW | others)
 
     @property
     def light_is_given(self) -> bool:
