@@ -18,8 +18,8 @@ import drjit as dr
 
 from gshell_mi.doctor import ensure_variant
 
-#: Steps before the clock starts, which compile kernels, and steps that are timed.
-_WARM_UP, _STEPS = 6, 24
+#: Steps before the clock starts, which compile kernels.
+_WARM_UP = 4
 
 #: Phases that are rendering.
 _RENDERING = ("render", "render backward")
@@ -45,19 +45,20 @@ def joint_stage(scene: Path, output: Path):
     return joint
 
 
-def seconds_per_phase(joint, first: int, clock: Callable[[], float]) -> tuple[dict[str, float], float]:
+def seconds_per_phase(joint, first: int, count: int,
+                      clock: Callable[[], float]) -> tuple[dict[str, float], float]:
     """Mean seconds per phase of an iteration, and of an iteration that nobody interrupts."""
     from gshell_mi.timing import Stopwatch
 
     free = clock()
-    for step in range(first, first + _STEPS):
+    for step in range(first, first + count):
         joint.step(step)
     dr.sync_thread()
-    free = (clock() - free) / _STEPS
+    free = (clock() - free) / count
     with Stopwatch(clock) as watch:
-        for step in range(first + _STEPS, first + 2 * _STEPS):
+        for step in range(first + count, first + 2 * count):
             joint.step(step)
-    return {name: seconds / _STEPS for name, seconds in watch.seconds.items()}, free
+    return {name: seconds / count for name, seconds in watch.seconds.items()}, free
 
 
 def table(seconds: dict[str, float], free: float) -> str:
@@ -77,6 +78,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("output", type=Path, help="folder of a finished fit of the scene")
     parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--steps", type=int, default=24, help="iterations that are timed")
     parser.add_argument("--cpu", action="store_true", help="processor time instead of wall time")
     given = parser.parse_args()
     ensure_variant(given.variant)
@@ -85,7 +87,7 @@ def main() -> None:
     for step in range(last, last + _WARM_UP):
         joint.step(step)
     clock = time.process_time if given.cpu else time.perf_counter
-    print(table(*seconds_per_phase(joint, last + _WARM_UP, clock)))
+    print(table(*seconds_per_phase(joint, last + _WARM_UP, given.steps, clock)))
 
 
 if __name__ == "__main__":

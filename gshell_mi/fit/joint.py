@@ -79,10 +79,12 @@ class JointStage:
                               seed=2 * iteration, seed_grad=2 * iteration + 1)
             compute(image)
         target = self._targets[index]
-        color = losses.IMAGE_LOSSES[config.image_loss](image[..., :3], target[..., :3])
-        mask = losses.mask_l2(image[..., 3], target[..., 3]) if self._sees_masks else mi.Float(0)
-        regularisation, terms = self._regularisers(index)
-        total = color + config.joint_mask * mask + regularisation
+        with phase("losses") as compute:
+            color = losses.IMAGE_LOSSES[config.image_loss](image[..., :3], target[..., :3])
+            mask = losses.mask_l2(image[..., 3], target[..., 3]) if self._sees_masks else mi.Float(0)
+            regularisation, terms = self._regularisers(index)
+            total = color + config.joint_mask * mask + regularisation
+            compute(total)
         with phase("backward") as compute:
             dr.backward(total)
             compute(*(dr.grad(value) for value in (*self.fields.values(), *self.shading.values())))
