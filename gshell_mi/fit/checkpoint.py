@@ -29,6 +29,7 @@ class Checkpoint:
         arrays: everything else, by name.
         seconds: time spent per stage so far.
         config: the configuration, as JSON-able values.
+        facts: what stages found out that belongs into the metrics, as JSON-able values.
     """
 
     stage: str
@@ -36,6 +37,7 @@ class Checkpoint:
     config: dict
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    facts: dict[str, bool] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
         """Writes the file beside its place and moves it there in one step.
@@ -44,7 +46,7 @@ class Checkpoint:
             UserError: the folder is full or not writable; an older checkpoint stays as it was.
         """
         header = json.dumps({"format": FORMAT, "stage": self.stage, "iteration": self.iteration,
-                             "config": self.config, "seconds": self.seconds})
+                             "config": self.config, "seconds": self.seconds, "facts": self.facts})
         try:
             with replacing(path) as partial, open(partial, "wb") as file:
                 np.savez(file, header=np.array(header), **self.arrays)

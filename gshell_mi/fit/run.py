@@ -136,7 +136,10 @@ class _Fit:
             if self.checkpoint.stage == "ghost":
                 self._ghost()
             if self.checkpoint.stage == "refinement":
+                hull = self.checkpoint.arrays["sdf"]
                 self._refine()
+                moved = not np.array_equal(hull, self.checkpoint.arrays["sdf"])
+                self.checkpoint.facts["refinement_kept"] = moved
             joint = self._joint()
             self.interrupt.check()
             with self.progress.stage("export", None), self._timed("export"):
@@ -328,7 +331,7 @@ class _Fit:
 
     def _write_metrics(self, metrics: dict) -> dict:
         mib = {"estimated_memory_mib": self.memory.total, "peak_memory_mib": peak_memory()}
-        metrics = metrics | {name: round(size / 2**20) for name, size in mib.items()}
+        metrics = metrics | self.checkpoint.facts | {name: round(size / 2**20) for name, size in mib.items()}
         return write_metrics(self.output, metrics, self.checkpoint.seconds)
 
     def _fit_field(self, joint: JointStage) -> None:

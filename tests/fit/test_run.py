@@ -98,6 +98,12 @@ def test_metrics(whole):
     assert {"hull", "ghost", "refinement", "joint", "total"} <= set(metrics["seconds"])
 
 
+@pytest.mark.parametrize(("gain", "kept"), [("0", False), ("1000", True)])
+def test_metrics_say_whether_the_refinement_was_kept(bowl_scene, tmp_path, gain, kept):
+    assert fit(bowl_scene, tmp_path / "out", *CLOSED, "--iterations", "0", "--refinement-gain", gain) == 0
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["refinement_kept"] is kept
+
+
 def test_log_has_a_line_per_step(whole):
     assert steps(whole) == [(stage, i) for stage, count in (("ghost", 100), ("refinement", 8), ("joint", 12))
                             for i in range(count)]
