@@ -23,7 +23,7 @@ class HashGridNetwork(NetworkFields):
     The finest level of the encoding has the lattice's own cells; finer ones would be noise to it.
     """
 
-    fitting_steps = 400
+    fitting_steps = 600
     fitting_rate = 1e-2
     rate = 1e-3
 

@@ -33,7 +33,7 @@ class SinusoidalNetwork(NetworkFields):
     about normally distributed.
     """
 
-    fitting_steps = 600
+    fitting_steps = 800
     fitting_rate = 1e-3
     rate = 1e-4
 
