@@ -2,7 +2,8 @@
 
 The rooms, in the order in which data flows through them:
 
-- ``lattice``, ``fields``, ``extraction``: from signed distances on a lattice to a triangle mesh
+- ``lattice``, ``sign_scan``, ``block_lattice``, ``fields``, ``extraction``: from signed distances on a
+  lattice, or on its blocks around the surface, to a triangle mesh
 - ``shape``: the same as a Mitsuba shape, ``{"type": "gshell"}``
 - ``integrators``: rendering with right derivatives, ``{"type": "gshell_path"}`` and ``gshell_mask``
 - ``capture``: photographs with known cameras become a fit scene, ``python -m gshell_mi.capture``
@@ -26,18 +27,19 @@ Importing the package sets no variant; its plugins register for the variant in u
 True
 """
 
+from .block_lattice import BlockLattice
 from .errors import UserError
-from .extraction import NarrowBand, SurfaceMesh, extract
+from .extraction import SurfaceMesh, extract
 from .fields import LatticeFields
 from .lattice import CubeLattice, FlexiCubesLattice, TetLattice, make_lattice
 from .plugins import register_on_variant_change
 
 __version__ = "0.1.0"
 __all__ = [
+    "BlockLattice",
     "CubeLattice",
     "FlexiCubesLattice",
     "LatticeFields",
-    "NarrowBand",
     "SurfaceMesh",
     "TetLattice",
     "UserError",

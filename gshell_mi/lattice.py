@@ -109,11 +109,14 @@ class Lattice:
 
     def offset_positions(self, vertex: Any, deform: Any, float_t: type) -> Any:
         """Positions of the vertices with the ids ``vertex``, offset by ``deform`` unless that is None."""
-        p = self.positions_of(vertex, float_t)
+        return self.offset(self.positions_of(vertex, float_t), deform, vertex)
+
+    def offset(self, p: Any, deform: Any, index: Any) -> Any:
+        """Positions p moved by the offsets at ``index`` of ``deform``, unless that is None."""
         if deform is None:
             return p
-        offset = dr.gather(type(p), deform, vertex, mode=dr.ReduceMode.Local)
-        return dr.fma(dr.clip(offset, -1, 1), dr.opaque(float_t, self.max_offset), p)
+        offset = dr.gather(type(p), deform, index, mode=dr.ReduceMode.Local)
+        return dr.fma(dr.clip(offset, -1, 1), dr.opaque(dr.leaf_t(p), self.max_offset), p)
 
 
 @dataclass(frozen=True)

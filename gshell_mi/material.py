@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .fields.carried import Carried
+
 #: Range of roughness: below, paths to a small light become too rare for a fit's few samples.
 ROUGHNESS_RANGE = (0.08, 1.0)
 
@@ -40,6 +42,10 @@ class MaterialField:
             "vertex_metallic": dr.full(mi.Float, float(_logit(metallic)), count),
         }
 
+    def carry(self, carried: Carried) -> None:
+        """Moves the parameters to other blocks of the lattice."""
+        self.parameters = {name: carried.values(dr.detach(field)) for name, field in self.parameters.items()}
+
     def values(self) -> dict[str, mi.Float]:
         """The lattice fields themselves, all in [0, 1], by attribute name."""
         unit = {name: dr.rcp(1 + dr.exp(-logits)) for name, logits in self.parameters.items()}
@@ -64,6 +70,10 @@ class GivenMaterial:
         self._values = {"vertex_color": mi.Float(color.astype(np.float32).ravel()),
                         "vertex_roughness": dr.full(mi.Float, roughness, count),
                         "vertex_metallic": dr.full(mi.Float, metallic, count)}
+
+    def carry(self, carried: Carried) -> None:
+        """Moves the values to other blocks of the lattice."""
+        self._values = {name: carried.values(field) for name, field in self._values.items()}
 
     def values(self) -> dict[str, mi.Float]:
         """The lattice fields by attribute name."""

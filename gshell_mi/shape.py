@@ -8,10 +8,12 @@ import mitsuba as mi
 import numpy as np
 
 from . import compat, memory
+from .block_lattice import BlockLattice
 from .errors import UserError
 from .extraction import SurfaceMesh, extract
 from .extraction.surface_mesh import gather
 from .fields import LatticeFields, from_mesh, sphere
+from .fields.carried import Carried
 from .lattice import make_lattice
 from .timing import phase
 
@@ -34,6 +36,8 @@ class GShell(mi.Mesh):
     ``filename``            string: initial fields: an .npz with ``sdf`` and, if wanted, ``msdf`` and
                             ``deform``, or a mesh file in world space (default: a sphere of radius 0.5
                             in lattice units)
+    ``band``                boolean: keep the fields in blocks around the surface only, so that memory
+                            grows with the square of the resolution (default: false)
     ``face_normals``        boolean: shade with face normals (default: false, smooth normals)
     (nested)                bsdf: the material
     ======================  =================================================================
@@ -41,7 +45,8 @@ class GShell(mi.Mesh):
     ``mi.traverse`` shows, beside the parameters of a mesh:
 
     ======================  =================================================================
-    ``sdf``, ``msdf``       one value per lattice vertex, in lattice units
+    ``sdf``, ``msdf``       one value per lattice vertex, in lattice units; with ``band`` per stored
+                            vertex of ``lattice``, a ``BlockLattice``, and so the others
     ``deform``              three values per lattice vertex; 1 is the greatest offset that rules out
                             self-intersection, beyond it they are clipped
     ``weights``             with ``flexicubes`` only: 21 values per cube, 0 is neutral, see ``extract``
@@ -79,11 +84,12 @@ class GShell(mi.Mesh):
         resolution = int(props["resolution"]) if "resolution" in props else None
         self.filename = props.get("filename", "")
         smooth = not props.get("face_normals", False)
+        band = props.get("band", False)
         self.to_world = compat.to_world(props)
         compat.init_mesh(self, props, has_vertex_normals=smooth)
         self._attributes: dict[str, tuple[Any, int]] = {}
         self._mirrored = bool(np.linalg.det(np.array(self.to_world.matrix)[:3, :3]) < 0)
-        self.set_fields(_initial_fields(self.filename, grid, resolution, self.to_world))
+        self.set_fields(_initial_fields(self.filename, grid, resolution, self.to_world, band))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         differentiable = mi.ParamFlags.Differentiable
@@ -151,7 +157,36 @@ class GShell(mi.Mesh):
     def fields(self) -> LatticeFields:
         """A copy of the present fields on the host."""
         arrays = {name: np.array(dr.detach(getattr(self, name))) for name in self.field_names}
+        if isinstance(self.lattice, BlockLattice):
+            arrays |= {"blocks": self.lattice.blocks.numpy(), "block_resolution": self.lattice.resolution}
         return LatticeFields(grid=self.lattice.grid, **arrays)
+
+    def follow(self, *, rescan: bool = False) -> Carried | None:
+        """With ``band``: lets the blocks follow the surface, to be called after ``params.update()``.
+
+        Blocks are added when the surface has come near their edge. Parameters that an earlier
+        ``mi.traverse`` has shown stay valid and have new sizes.
+
+        Args:
+            rescan: also drop the blocks that the surface has left.
+
+        Returns:
+            What brings an optimiser's state to the new blocks; None if the blocks stay.
+        """
+        before = self.lattice
+        if not isinstance(before, BlockLattice) or (not rescan and before.covers(self.surface.cells)):
+            return None
+        carried = Carried.following(before, self.surface.cells, self.sdf, keep=not rescan)
+        if carried.is_identity:
+            return None
+        params = mi.traverse(self)
+        for name, field in self._fields().items():
+            params[name] = carried.sdf(field) if name == "sdf" else carried.values(dr.detach(field))
+        for name, (field, _) in self._attributes.items():
+            params[_LATTICE_PREFIX + name] = carried.values(dr.detach(field))
+        self.lattice = carried.after
+        params.update()
+        return carried
 
     def template(self) -> SurfaceMesh:
         """The watertight template of the present fields, in world space."""
@@ -228,23 +263,25 @@ class _Padding:
         return dr.select(exists, padded, 0) if fill_with_zero else padded
 
 
-def _initial_fields(filename: str, grid: str, resolution: int | None, to_world: Any) -> LatticeFields:
+def _initial_fields(filename: str, grid: str, resolution: int | None, to_world: Any,
+                    band: bool) -> LatticeFields:
     lattice = make_lattice(grid, 64 if resolution is None else resolution)
-    if lattice.resolution > _LARGE:
+    if lattice.resolution > _LARGE and not band:
         memory.require(_BYTES_PER_VERTEX * lattice.vertex_count, memory.free_memory_of_variant(),
                        f"A lattice of {lattice.resolution} cells per side", "lower its resolution")
     if not filename:
-        return sphere(lattice)
+        return sphere(lattice, in_blocks=band)
     path = mi.file_resolver().resolve(filename)
     if not str(path).endswith(".npz"):
-        return from_mesh(str(path), lattice, to_world=np.array(to_world.matrix))
+        fields = from_mesh(str(path), lattice, to_world=np.array(to_world.matrix))
+        return fields.in_blocks() if band else fields
     fields = LatticeFields.load(str(path), grid)
     if resolution not in (None, fields.lattice.resolution):
         raise UserError(
             f"{path}: holds fields of resolution {fields.lattice.resolution}, but the shape asks for "
             f"{resolution}; leave 'resolution' out or change it"
         )
-    return fields
+    return fields.in_blocks() if band and fields.blocks is None else fields
 
 
 mi.register_shape("gshell", lambda props: GShell(props))

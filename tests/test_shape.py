@@ -356,3 +356,40 @@ def test_weights_are_a_parameter_of_flexicubes_alone():
     assert 0.01 < moved < subject.lattice.spacing
     np.testing.assert_array_equal(subject.fields().weights, weights)
     assert subject.template().vertex_count == subject.surface.vertex_count
+
+
+def test_band_gives_the_same_mesh_and_follows():
+    scenes = [_scene(resolution=70, grid="tet", band=band) for band in (False, True)]
+    whole, stored = (_subject(scene) for scene in scenes)
+    assert stored.lattice.vertex_count < 0.6 * whole.lattice.vertex_count
+    for a, b in zip(whole.surface.to_numpy(), stored.surface.to_numpy(), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)  # the sphere's values are not computed alike
+    params = mi.traverse(scenes[1])
+    stored.attach_attribute("vertex_color", stored.lattice.points(mi.Float).x)
+    assert stored.follow() is None and whole.follow() is None
+    before = stored.lattice
+    params["subject.sdf"] = params["subject.sdf"] - 2.5 * before.spacing
+    params.update()
+    carried = stored.follow()
+    assert carried.before is before and carried.after is stored.lattice
+    assert stored.lattice.vertex_count > before.vertex_count
+    # The parameters of the earlier traversal still work, with the new sizes.
+    assert dr.width(params["subject.sdf"]) == stored.lattice.vertex_count
+    params["subject.sdf"] = params["subject.sdf"] - 2.5 * before.spacing
+    params.update()
+    assert _depth(scenes[1])[0] == pytest.approx(3.5 - 5 * before.spacing, abs=5e-3)
+    color = stored.surface.interpolate(stored._attributes["vertex_color"][0]).numpy()
+    np.testing.assert_allclose(color, stored.surface.to_numpy()[0][:, 0], atol=0.5 * before.spacing)
+    assert stored.follow(rescan=True) is not None and stored.follow(rescan=True) is None
+    assert _depth(scenes[1])[0] == pytest.approx(3.5 - 5 * before.spacing, abs=5e-3)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_fields_in_blocks_from_a_file(tmp_path, grid):
+    given = sphere(make_lattice(grid, 40), 0.4).in_blocks()
+    given.save(tmp_path / "ball.npz")
+    subject = _subject(_scene(filename=str(tmp_path / "ball.npz"), grid=grid, resolution=40))
+    assert subject.surface.to_trimesh().is_watertight
+    again = subject.fields()
+    for name in ("sdf", "msdf", "deform", "blocks"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(given, name))

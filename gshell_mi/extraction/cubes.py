@@ -12,9 +12,9 @@ from typing import Any
 
 import drjit as dr
 
+from ..sign_scan import expand
 from . import cube_tables as tables
 from .grid_extraction import ActiveCells, MarchingExtraction
-from .sign_scan import expand
 from .surface_mesh import concatenate
 
 

@@ -4,12 +4,12 @@ from typing import Any
 
 import drjit as dr
 
+from ..block_lattice import BlockLattice
 from ..errors import UserError
 from ..lattice import CubeLattice, FlexiCubesLattice, Lattice, TetLattice
 from .cubes import CubeExtraction
 from .flexicubes import FlexiCubesExtraction
 from .grid_extraction import GridExtraction
-from .narrow_band import NarrowBand
 from .surface_mesh import SurfaceMesh
 from .tetrahedra import TetExtraction
 
@@ -21,13 +21,12 @@ _ALGORITHMS: dict[str, type[GridExtraction]] = {
 
 
 def extract(
-    lattice: Lattice,
+    lattice: Lattice | BlockLattice,
     sdf: Any,
     msdf: Any = None,
     deform: Any = None,
     *,
     weights: Any = None,
-    band: NarrowBand | None = None,
     template: bool = False,
 ) -> SurfaceMesh:
     """The surface ``{sdf = 0, msdf >= 0}`` as a triangle mesh, differentiable in all three fields.
@@ -39,7 +38,8 @@ def extract(
     lattice has a watertight template. (In FlexiCubes the border counts as outside.)
 
     Args:
-        lattice: the lattice of n vertices; its docstring gives their order.
+        lattice: the lattice of n vertices, whose docstring gives their order; or, as a narrow band, a
+            ``BlockLattice`` of n stored vertices.
         sdf: signed distance in lattice units, Dr.Jit ``Float`` or tensor of n values. Its type decides
             the backend that everything is computed on.
         msdf: manifold signed distance (n values); None keeps the whole template.
@@ -47,7 +47,6 @@ def extract(
             (x0, y0, z0, x1, ...), clipped to [-1, 1], where 1 is ``lattice.max_offset``; None for none.
         weights: for a ``FlexiCubesLattice``, 21 values per cube (``weight_count``). Any real number
             w stands for the positive weight 1 + 0.9 tanh(w); None for 0, which is neutral.
-        band: looks for the surface only where it was in the last call with this band.
         template: also return the watertight template as ``SurfaceMesh.template``.
 
     Raises:
@@ -72,15 +71,10 @@ def extract(
             )
         sizes["weights"], fields["weights"] = lattice.weight_count, weights
     fields = {name: _flat(name, field, sizes[name]) for name, field in fields.items() if field is not None}
-    scans_all = band is None or band.is_due(lattice)
-    if scans_all:
-        _check_finite(fields)
-    algorithm = _ALGORITHMS[lattice.grid](lattice, type(fields["sdf"]), band)
+    _check_finite(fields)
+    algorithm = _ALGORITHMS[lattice.grid](lattice, type(fields["sdf"]))
     arguments = (fields.get(name) for name in ("sdf", "msdf", "deform"))
-    mesh = algorithm.run(*arguments, template, fields.get("weights"))
-    if not scans_all and (mesh.is_empty or not _is_finite(mesh.vertices, mesh.msdf)):
-        _check_finite(fields)
-    return mesh
+    return algorithm.run(*arguments, template, fields.get("weights"))
 
 
 def _flat(name: str, field: Any, count: int) -> Any:

@@ -17,11 +17,11 @@ from typing import Any
 
 import drjit as dr
 
+from ..block_lattice import BlockLattice
 from ..lattice import FlexiCubesLattice, Lattice
+from ..sign_scan import corner_offset, expand, is_inside
 from . import cube_tables as tables
 from .grid_extraction import ActiveCells, GridExtraction
-from .narrow_band import NarrowBand
-from .sign_scan import active_cells, expand
 from .surface_mesh import CutPoints, DualPoints, EdgePoints, SurfaceMesh, concatenate, gather
 from .triangle_cut import cut_triangles
 
@@ -51,19 +51,19 @@ class FlexiCubesExtraction(GridExtraction):
     """FlexiCubes."""
 
     EDGE_DIFFERENCES = 0b00010110
+    CLOSED_AT_BORDER = True
 
-    def __init__(self, lattice: FlexiCubesLattice, float_t: type, band: NarrowBand | None = None):
-        super().__init__(lattice, float_t, band)
+    def __init__(self, lattice: FlexiCubesLattice | BlockLattice, float_t: type):
+        super().__init__(lattice, float_t)
         self.margin = dr.opaque(float_t, _MARGIN)
 
-    def run(self, sdf: Any, msdf: Any, deform: Any, with_template: bool, weights: Any) -> SurfaceMesh:
-        s = dr.detach(sdf)
-        cells = self.active_cells(s)
+    def surface(self, cells: ActiveCells, sdf: Any, msdf: Any, deform: Any, with_template: bool,
+                weights: Any) -> SurfaceMesh:
         a, _ = self.crossed_edges(cells)
         count = dr.width(a)
         if count == 0:
             return self.empty_mesh(with_template)
-        polygons = self.polygons(s, cells, self.record_edges(cells), weights, sdf)
+        polygons = self.polygons(cells, self.record_edges(cells), weights, sdf)
         points = polygons.points
 
         kept_count = points.count
@@ -72,14 +72,14 @@ class FlexiCubesExtraction(GridExtraction):
             kept_count = dr.width(kept)
         if kept_count == 0 and not with_template:
             return self.empty_mesh(False)
-        faces, diagonal = self.quads(s, a, polygons, weights, deform)
+        faces, diagonal = self.quads(cells.inside, a, polygons, weights, deform)
         if kept_count in (0, points.count):
             uncut = self.mesh((points,), faces, msdf, deform, kept_count)
             mesh = uncut if kept_count else self.empty_mesh(False)
             return replace(mesh, template=uncut) if with_template else mesh
 
         order = self.kept_first(kept, dropped)
-        names = self.edge_names(count, polygons, s, a, diagonal)
+        names = self.edge_names(count, polygons, cells.inside, a, diagonal)
         faces = self.faces_t(*(dr.gather(self.uint_t, order, corner) for corner in faces))
         dr.eval(faces)
         kept_points, dropped_points = points.at(kept), points.at(dropped)
@@ -96,30 +96,7 @@ class FlexiCubesExtraction(GridExtraction):
 
     # Polygons -----------------------------------------------------------------------------------------
 
-    def active_cells(self, s: Any) -> ActiveCells:
-        cell = active_cells(s, self.lattice, closed=True, band=self.band)
-        return self.classify(s, cell) if dr.width(cell) else ActiveCells(cell, cell, cell, cell)
-
-    def classify(self, s: Any, cell: Any) -> ActiveCells:
-        """Vertices on the border of the lattice are outside."""
-        cells = super().classify(s, cell)
-        last = self.stride - 1
-        signs = cells.signs
-        for axis, coordinate in enumerate(self.coordinates(cell)):
-            low = sum(1 << c for c in range(8) if not c >> axis & 1)
-            signs &= ~dr.select((coordinate == 0) | (coordinate == last), self.uint_t(low), 0)
-            signs &= ~dr.select(coordinate + 1 >= last, self.uint_t(255 - low), 0)
-        own = signs & 1 == 1
-        crossed = (signs ^ dr.select(own, self.uint_t(255), 0)) & self.EDGE_DIFFERENCES
-        dr.eval(signs, crossed)
-        return replace(cells, signs=signs, crossed=crossed)
-
-    def coordinates(self, vertex: Any) -> tuple[Any, Any, Any]:
-        row = vertex // self.stride
-        z = row // self.stride
-        return vertex - row * self.stride, row - z * self.stride, z
-
-    def cases(self, s: Any, cells: ActiveCells) -> Any:
+    def cases(self, cells: ActiveCells) -> Any:
         """Signs, + 256 where both cubes at an ambiguous face visit it twice."""
         faces = self.uint_t(tables.twice_visited_face_table())
         face = dr.gather(self.uint_t, faces, cells.signs, cells.border == 0)
@@ -130,17 +107,16 @@ class FlexiCubesExtraction(GridExtraction):
         if dr.width(visited) == 1:  # arrays of one element have kernels of their own
             visited = dr.gather(self.uint_t, visited, dr.zeros(self.uint_t, 2))
         face = dr.gather(self.uint_t, face, visited)
-        step = self.corner_offset(self.uint_t(1) << (face >> 1))
         cell = dr.gather(self.uint_t, cells.cell, visited)
         # There is a neighbour, as nothing crosses the border.
-        neighbour = self.classify(s, dr.select(face & 1 == 1, cell + step, cell - step))
+        neighbour = self.classify(cells.inside, self.neighbour(cell, face >> 1, face & 1 == 1))
         both = dr.gather(self.uint_t, faces, neighbour.signs) == face ^ 1
         signs = dr.gather(self.uint_t, cells.signs, visited)
         dr.scatter(case, signs + 256, visited, both, dr.ReduceMode.Permute)
         return case
 
-    def polygons(self, s: Any, cells: ActiveCells, record: Any, weights: Any, sdf: Any) -> _Polygons:
-        case = self.cases(s, cells)
+    def polygons(self, cells: ActiveCells, record: Any, weights: Any, sdf: Any) -> _Polygons:
+        case = self.cases(cells)
         masks = self.uint_t(tables.polygon_mask_table())
         owner, number = expand(dr.gather(self.uint_t, masks, case, cells.border == 0), 2)
         key = dr.gather(self.uint_t, case, owner) << 2 | number
@@ -160,8 +136,8 @@ class FlexiCubesExtraction(GridExtraction):
         around = dr.gather(self.uint_t, self.uint_t(tables.around_table()), entry)
         base = dr.gather(self.uint_t, cell, polygon)
         crossing = self.edge_vertex(record, base, edge)
-        a = base + self.corner_offset(edge >> 3)
-        b = a + self.corner_offset(edge & 7)
+        a = self.corner(base, edge >> 3)
+        b = self.corner(a, edge & 7)
         dr.eval(exists, side, around, crossing, a, b)
 
         t = self.zero_crossing(self.value(sdf, a), self.value(sdf, b))
@@ -185,7 +161,17 @@ class FlexiCubesExtraction(GridExtraction):
             border |= (coordinate == 0) | (coordinate == last)
         return dr.select(border & (value < 0), 0, value)
 
+    def neighbour(self, vertex: Any, axis: Any, up: Any) -> Any:
+        """The next vertex up or down an axis."""
+        if isinstance(self.lattice, BlockLattice):
+            return self.lattice.neighbour(vertex, axis, up)
+        step = corner_offset(self.uint_t(1) << axis, self.stride)
+        return dr.select(up, vertex + step, vertex - step)
+
     def cube(self, cell: Any) -> Any:
+        """Number of the cube above a vertex among those that have weights."""
+        if isinstance(self.lattice, BlockLattice):
+            return cell
         x, y, z = self.coordinates(cell)
         side = self.stride - 1
         return x + (y + z * side) * side
@@ -195,7 +181,7 @@ class FlexiCubesExtraction(GridExtraction):
 
     # Quads --------------------------------------------------------------------------------------------
 
-    def quads(self, s: Any, a: Any, polygons: _Polygons, weights: Any, deform: Any) -> tuple[Any, Any]:
+    def quads(self, inside: Any, a: Any, polygons: _Polygons, weights: Any, deform: Any) -> tuple[Any, Any]:
         """Two triangles per crossed edge, and whether its quad is split from the first corner on."""
         count = dr.width(a)
         slot = dr.arange(self.uint_t, dr.width(polygons.crossing))
@@ -205,7 +191,7 @@ class FlexiCubesExtraction(GridExtraction):
         dr.eval(corner)
 
         quad = dr.arange(self.uint_t, count) << 2
-        index = [dr.gather(self.uint_t, corner, quad + k) for k in self.turn(s, a)]
+        index = [dr.gather(self.uint_t, corner, quad + k) for k in self.turn(inside, a)]
         detached = dr.detach((polygons.points, deform))
         positions = detached[0].apply(
             lambda vertex: self.lattice.offset_positions(vertex, detached[1], self.float_t)
@@ -233,9 +219,9 @@ class FlexiCubesExtraction(GridExtraction):
         dr.eval(faces)
         return faces, first
 
-    def turn(self, s: Any, a: Any) -> list:
+    def turn(self, inside: Any, a: Any) -> list:
         """The numbers of the cubes around edges, anticlockwise seen from outside."""
-        upwards = self.value(s, a) < 0  # the lower end is inside
+        upwards = is_inside(inside, a)
         return [self.uint_t(0), dr.select(upwards, self.uint_t(1), 2), self.uint_t(3),
                 dr.select(upwards, self.uint_t(2), 1)]
 
@@ -247,7 +233,7 @@ class FlexiCubesExtraction(GridExtraction):
             dr.squared_norm(dr.cross(p[3] - p[2], p[0] - p[2])),
         )
 
-    def edge_names(self, count: int, polygons: _Polygons, s: Any, a: Any, diagonal: Any) -> Any:
+    def edge_names(self, count: int, polygons: _Polygons, inside: Any, a: Any, diagonal: Any) -> Any:
         """Names of the triangles' edges: four times a crossing plus a face around it, or a diagonal's."""
         slot = dr.arange(self.uint_t, dr.width(polygons.crossing))
         following = dr.gather(self.uint_t, polygons.crossing, (slot & ~self.uint_t(7)) | polygons.side >> 4)
@@ -258,7 +244,7 @@ class FlexiCubesExtraction(GridExtraction):
         dr.eval(names)
 
         # The faces between the cubes 0 and 1, 1 and 3, 3 and 2, 2 and 0 extend along +v, -u, -v, +u.
-        upwards = self.value(s, a) < 0
+        upwards = is_inside(inside, a)
         order = [(2, 0), (1, 3), (3, 1), (0, 2)]
         quad = dr.arange(self.uint_t, count) << 2
         side = [

@@ -5,7 +5,7 @@ without searching for duplicates:
 
 1. One pass over the signs finds the active cells. A cell owns the edges whose lowest vertex is its own.
 2. The number of crossed edges before a cell (a prefix sum) plus the rank of an edge in its cell is the
-   edge's vertex. One dense array, never cleared, holds both for every active cell.
+   edge's vertex. One array over the lattice, never cleared, holds both for every active cell.
 3. The cut runs through faces of the lattice, so its vertices are numbered in the same way. Both polygons
    at a face find the same number: the boundary is welded by construction.
 
@@ -18,10 +18,10 @@ from typing import Any, ClassVar
 
 import drjit as dr
 
+from ..block_lattice import BlockLattice
 from ..errors import UserError
 from ..lattice import Lattice, array_type
-from .narrow_band import NarrowBand
-from .sign_scan import NEGATIVE, active_cells, corner_offset, expand
+from ..sign_scan import MISSING, NEGATIVE, active_cells, corner_offset, expand, is_inside
 from .surface_mesh import CutPoints, EdgePoints, Stencil, SurfaceMesh, concatenate, gather
 
 #: Field values smaller than this count as this, so that gradients of slivers stay below 1e7.
@@ -34,6 +34,8 @@ _MAX_VERTICES = 1 << 25  # what fits beside 7 edge bits in the 32 bits of a cell
 class ActiveCells:
     """The cells with crossed edges; those at the upper borders are cells for the edges that they own."""
 
+    inside: Any
+    """The signs of all vertices, 32 to a word."""
     cell: Any
     """Ids of their lowest vertices, ascending."""
     signs: Any
@@ -50,9 +52,11 @@ class GridExtraction(ABC):
     EDGE_DIFFERENCES: ClassVar[int]
     """Bit d: the lattice has edges from the lowest corner of a cell to corner d."""
 
-    def __init__(self, lattice: Lattice, float_t: type, band: NarrowBand | None = None):
+    CLOSED_AT_BORDER: ClassVar[bool] = False
+    """Vertices on the border of the lattice count as outside."""
+
+    def __init__(self, lattice: Lattice | BlockLattice, float_t: type):
         self.lattice = lattice
-        self.band = band
         self.float_t = float_t
         self.uint_t = uint_t = dr.uint32_array_t(float_t)
         self.vertices_t = array_type(float_t, "Array3f")
@@ -63,40 +67,52 @@ class GridExtraction(ABC):
         # spans 16 units in the last place of a coordinate near 1.
         self.margin = dr.opaque(float_t, (16 * 2.0**-24 / lattice.spacing) ** 0.5)
 
-    @abstractmethod
     def run(self, sdf: Any, msdf: Any, deform: Any, with_template: bool, weights: Any) -> SurfaceMesh:
         """The mesh of flat fields that ``extract`` has checked."""
+        cells = self.active_cells(dr.detach(sdf))
+        return replace(self.surface(cells, sdf, msdf, deform, with_template, weights), cells=cells.cell)
+
+    @abstractmethod
+    def surface(self, cells: ActiveCells, sdf: Any, msdf: Any, deform: Any, with_template: bool,
+                weights: Any) -> SurfaceMesh:
+        """The mesh in the active cells."""
 
     # Edges --------------------------------------------------------------------------------------------
 
-    def corner_offset(self, corner: Any) -> Any:
-        """Difference between the ids of a cell's corner and of its lowest vertex."""
-        return corner_offset(corner, self.stride)
+    def corner(self, vertex: Any, corner: Any) -> Any:
+        """The lattice vertex at a corner of the cell above ``vertex``; arbitrary where there is none."""
+        if isinstance(self.lattice, BlockLattice):
+            return self.lattice.corner(vertex, corner)
+        return vertex + corner_offset(corner, self.stride)
+
+    def coordinates(self, vertex: Any) -> tuple[Any, Any, Any]:
+        if isinstance(self.lattice, BlockLattice):
+            vertex = self.lattice.lattice_vertex(vertex)
+        row = vertex // self.stride
+        z = row // self.stride
+        return vertex - row * self.stride, row - z * self.stride, z
 
     def active_cells(self, s: Any) -> ActiveCells:
         """The cells with crossed edges and few others."""
-        cell = active_cells(s, self.lattice, band=self.band)
+        cell, inside = active_cells(s, self.lattice, self.CLOSED_AT_BORDER)
         # Operands of size 0 do not go together with others of size 1.
-        return self.classify(s, cell) if dr.width(cell) else ActiveCells(cell, cell, cell, cell)
+        return self.classify(inside, cell) if dr.width(cell) else ActiveCells(inside, cell, cell, cell, cell)
 
-    def classify(self, s: Any, cell: Any) -> ActiveCells:
-        row = cell // self.stride
-        z = row // self.stride
-        last = self.stride - 1
-        border = dr.select(cell - row * self.stride == last, self.uint_t(1), 0)
-        border |= dr.select(row - z * self.stride == last, self.uint_t(2), 0)
-        border |= dr.select(z == last, self.uint_t(4), 0)
-        # A corner outside the lattice takes the sign of the cell's own vertex: no edge there is crossed.
-        own = dr.gather(self.float_t, s, cell) < NEGATIVE
+    def classify(self, inside: Any, cell: Any) -> ActiveCells:
+        border = dr.zeros(self.uint_t)
+        for axis, coordinate in enumerate(self.coordinates(cell)):
+            border |= dr.select(coordinate == self.stride - 1, self.uint_t(1 << axis), 0)
+        # A corner that does not exist takes the sign of the cell's own vertex: no edge there is crossed.
+        own = is_inside(inside, cell)
         signs = dr.select(own, self.uint_t(1), 0)
         for corner in range(1, 8):
-            exists = border & corner == 0
-            neighbour = cell + self.corner_offset(self.uint_t(corner))
-            inside = dr.gather(self.float_t, s, neighbour, active=exists) < NEGATIVE
-            signs |= dr.select(dr.select(exists, inside, own), self.uint_t(1 << corner), 0)
+            neighbour = self.corner(cell, self.uint_t(corner))
+            exists = (border & corner == 0) & (neighbour != MISSING)
+            sign = dr.select(exists, is_inside(inside, neighbour, exists), own)
+            signs |= dr.select(sign, self.uint_t(1 << corner), 0)
         crossed = (signs ^ dr.select(own, self.uint_t(255), 0)) & self.EDGE_DIFFERENCES
         dr.eval(signs, crossed, border)
-        return ActiveCells(cell, signs, crossed, border)
+        return ActiveCells(inside, cell, signs, crossed, border)
 
     def crossed_edges(self, cells: ActiveCells) -> tuple[Any, Any]:
         """The lattice vertices that the crossed edges join, in the order of the mesh vertices on them."""
@@ -110,12 +126,12 @@ class GridExtraction(ABC):
         if count == 0:
             return owner, owner
         a = dr.gather(self.uint_t, cells.cell, owner)
-        b = a + self.corner_offset(difference)
+        b = self.corner(a, difference)
         dr.eval(a, b)
         return a, b
 
     def record_edges(self, cells: ActiveCells) -> Any:
-        """Dense array that holds, for every active cell, its first mesh vertex and its crossed edges.
+        """Array over the lattice: for every active cell, its first mesh vertex and its crossed edges.
 
         Entries of other cells are arbitrary and never read.
         """
@@ -126,7 +142,7 @@ class GridExtraction(ABC):
 
     def edge_vertex(self, record: Any, base: Any, edge: Any, active: Any = True) -> Any:
         """The mesh vertex on an edge (corner << 3 | difference) of the cell ``base``."""
-        entry = dr.gather(self.uint_t, record, base + self.corner_offset(edge >> 3), active)
+        entry = dr.gather(self.uint_t, record, self.corner(base, edge >> 3), active)
         below = (self.uint_t(1) << ((edge & 7) - 1)) - 1
         return (entry >> 7) + dr.popcnt(entry & below)
 
@@ -196,9 +212,8 @@ class GridExtraction(ABC):
 class MarchingExtraction(GridExtraction):
     """Extractions whose polygons' vertices lie on the edges of the lattice."""
 
-    def run(self, sdf: Any, msdf: Any, deform: Any, with_template: bool, weights: Any) -> SurfaceMesh:
-        s = dr.detach(sdf)
-        cells = self.active_cells(s)
+    def surface(self, cells: ActiveCells, sdf: Any, msdf: Any, deform: Any, with_template: bool,
+                weights: Any) -> SurfaceMesh:
         a, b = self.crossed_edges(cells)
         count = dr.width(a)
         if count == 0:
@@ -208,7 +223,7 @@ class MarchingExtraction(GridExtraction):
 
         kept_count = count
         if msdf is not None:
-            kept, dropped = self.kept_and_dropped(self.edge_points(s, a, b), msdf)
+            kept, dropped = self.kept_and_dropped(self.edge_points(dr.detach(sdf), a, b), msdf)
             kept_count = dr.width(kept)
         if kept_count == 0 and not with_template:
             return self.empty_mesh(False)

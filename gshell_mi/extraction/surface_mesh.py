@@ -138,6 +138,8 @@ class SurfaceMesh:
     ``kept_vertex_count`` vertices are the first ones of this mesh."""
     kept_vertex_count: int = 0
     """Vertices of the template that stay; the vertices after them lie on the cut."""
+    cells: Any = None
+    """Lowest lattice vertices of the cells that the template passes through, and few others; ascending."""
 
     @property
     def vertex_count(self) -> int:

@@ -11,9 +11,9 @@ from typing import Any
 
 import drjit as dr
 
+from ..sign_scan import expand
 from . import tet_tables as tables
 from .grid_extraction import ActiveCells, MarchingExtraction
-from .sign_scan import expand
 from .surface_mesh import concatenate
 
 
@@ -100,7 +100,7 @@ class TetExtraction(MarchingExtraction):
             cut = stays[i] != stays[j]
             cuts.append(cut if i < 3 else cut & quad)
             side = sides >> (7 * i) & 127
-            entry = dr.gather(self.uint_t, record, polygons.base + self.corner_offset(side >> 4), cuts[i])
+            entry = dr.gather(self.uint_t, record, self.corner(polygons.base, side >> 4), cuts[i])
             owners.append(entry >> 7)  # the first vertex of a cell names the cell
             kinds.append(side & 15)
             start = dr.select(stays[i], polygons.corners[i], polygons.corners[j])

@@ -1,11 +1,15 @@
 """The three fields of a G-Shell on a lattice, as they are kept in files."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
+from ..block_lattice import BlockLattice
 from ..errors import UserError
 from ..lattice import Lattice, make_lattice
 
@@ -31,23 +35,43 @@ class LatticeFields:
     """The kind of lattice, one of ``lattice.GRIDS``."""
     weights: np.ndarray | None = None
     """Weights of FlexiCubes (``Lattice.weight_count``); None for neutral ones."""
+    blocks: np.ndarray | None = None
+    """Ids of the blocks that the fields are stored in, see ``BlockLattice``; None for the whole lattice."""
+    block_resolution: int = 0
+    """Cells per side of the lattice that the ``blocks`` are taken from."""
 
     @classmethod
-    def closed(cls, sdf: np.ndarray, grid: str = "tet") -> "LatticeFields":
+    def closed(cls, sdf: np.ndarray, grid: str = "tet") -> LatticeFields:
         """Fields of a watertight surface: mSDF positive everywhere, no offsets."""
         sdf = np.asarray(sdf, np.float32).ravel()
         return cls(sdf, np.ones_like(sdf), np.zeros(3 * sdf.size, np.float32), grid)
 
-    @property
-    def lattice(self) -> Lattice:
-        return make_lattice(self.grid, round(self.sdf.size ** (1 / 3)) - 1)
+    @cached_property
+    def lattice(self) -> Lattice | BlockLattice:
+        if self.blocks is None:
+            return make_lattice(self.grid, round(self.sdf.size ** (1 / 3)) - 1)
+        import mitsuba as mi  # blocks live on the device, of whichever variant is set
 
-    def to_lattice(self, resolution: int) -> "LatticeFields":
+        def sdf(blocks: BlockLattice) -> mi.Float:
+            if blocks.vertex_count != self.sdf.size:
+                raise UserError(f"sdf has {self.sdf.size} values, but its blocks have {blocks.vertex_count} "
+                                f"vertices")
+            return mi.Float(self.sdf)
+
+        return BlockLattice(make_lattice(self.grid, self.block_resolution), mi.UInt32(self.blocks), sdf)
+
+    def to_lattice(self, resolution: int) -> LatticeFields:
         """The fields on a lattice of another resolution, interpolated trilinearly; neutral weights.
 
         Offsets are kept as lengths: they double in units of ``deform`` when the cells halve, and are
         clipped to what the new lattice allows.
+
+        Raises:
+            UserError: the fields are stored in blocks, hence unknown elsewhere.
         """
+        if self.blocks is not None:
+            raise UserError("fields in blocks are known near their surface only and cannot be resampled; "
+                            "from_mesh makes fields of any resolution from the extracted mesh")
         old, new = self.lattice, make_lattice(self.grid, resolution)
 
         def zoom(values: np.ndarray) -> np.ndarray:
@@ -59,14 +83,40 @@ class LatticeFields:
         clipped = np.clip(deform, -1, 1).astype(np.float32)
         return LatticeFields(zoom(self.sdf), zoom(self.msdf), clipped.ravel(), self.grid)
 
+    def in_blocks(self, resolution: int | None = None) -> LatticeFields:
+        """The fields in blocks around their surface, of this lattice or, interpolated, of a finer one.
+
+        As ``to_lattice``, but only the blocks are ever in memory. Needs a Mitsuba variant.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        from .interpolation import Interpolation
+
+        old, new = self.lattice, make_lattice(self.grid, resolution or self.lattice.resolution)
+        given = {name: mi.Float(getattr(self, name)) for name in ("sdf", "msdf", "deform")}
+        if new == old:
+            blocks = BlockLattice.around(old, given["sdf"])
+            fields = {name: blocks.take(field) for name, field in given.items()}
+        else:
+            at = {name: Interpolation(field, old) for name, field in given.items()}
+            blocks = BlockLattice.around(new, at["sdf"], mi.Float)
+            points = blocks.points(mi.Float)
+            fields = {name: field(points) for name, field in at.items()}
+            fields["deform"] = dr.clip(fields["deform"] * (old.max_offset / new.max_offset), -1, 1)
+        return LatticeFields(**{name: field.numpy() for name, field in fields.items()}, grid=self.grid,
+                             blocks=blocks.blocks.numpy(), block_resolution=new.resolution)
+
     def save(self, path: str | Path) -> None:
-        """Writes a compressed .npz with the arrays ``sdf``, ``msdf``, ``deform`` and, if any, ``weights``."""
+        """Writes a compressed .npz with the arrays ``sdf``, ``msdf``, ``deform`` and, if any, the others."""
         weights = {} if self.weights is None else {"weights": self.weights}
+        if self.blocks is not None:
+            weights |= {"blocks": self.blocks, "block_resolution": np.array(self.block_resolution)}
         with open(path, "wb") as file:  # a file object, as NumPy would append .npz to other names
             np.savez_compressed(file, sdf=self.sdf, msdf=self.msdf, deform=self.deform, **weights)
 
     @classmethod
-    def load(cls, path: str | Path, grid: str = "tet") -> "LatticeFields":
+    def load(cls, path: str | Path, grid: str = "tet") -> LatticeFields:
         """Reads what ``save`` wrote; without ``msdf`` it is 1 and without ``deform`` 0 everywhere.
 
         Args:
@@ -83,12 +133,15 @@ class LatticeFields:
             raise UserError(f"{path}: cannot be read as an .npz archive of fields ({error})") from error
         if "sdf" not in arrays:
             raise UserError(f"{path}: holds no array 'sdf' (it has {', '.join(arrays) or 'none'})")
-        sdf = arrays["sdf"]
+        sdf, blocks = arrays["sdf"], None
         stride = round(sdf.size ** (1 / 3))
-        if stride**3 != sdf.size or stride < 2:
+        if "blocks" in arrays:
+            blocks = arrays["blocks"].astype(np.uint32)
+        elif stride**3 != sdf.size or stride < 2:
             raise UserError(f"{path}: sdf has {sdf.size} values, which is not (resolution + 1)^3")
         closed = cls.closed(sdf, grid)
-        fields = cls(sdf, arrays.get("msdf", closed.msdf), arrays.get("deform", closed.deform), grid)
+        fields = cls(sdf, arrays.get("msdf", closed.msdf), arrays.get("deform", closed.deform), grid,
+                     blocks=blocks, block_resolution=int(arrays.get("block_resolution", [0])[0]))
         if "weights" in arrays and fields.lattice.weight_count:
             fields = replace(fields, weights=arrays["weights"])
         sizes = {"msdf": sdf.size, "deform": 3 * sdf.size, "weights": fields.lattice.weight_count}

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..lattice import Lattice
+from .interpolation import Interpolation
 
 #: Iterations that invert the displacement; each shrinks the error by the displacement's slope.
 _INVERSIONS = 8
@@ -22,17 +23,10 @@ def advect(field: mi.Float, displacement: mi.Float, lattice: Lattice) -> mi.Floa
     Returns:
         The field afterwards, interpolated trilinearly.
     """
-    n = lattice.stride
-    channels = dr.width(field) // lattice.vertex_count
-    values, offsets = (mi.Texture3f(mi.TensorXf(data, (n, n, n, count)), wrap_mode=dr.WrapMode.Clamp)
-                       for data, count in ((field, channels), (displacement, 3)))
-
-    def texel(point: mi.Point3f) -> mi.Point3f:
-        return ((point + 1) / lattice.spacing + 0.5) / n
-
+    values, offsets = Interpolation(field, lattice), Interpolation(displacement, lattice)
     points = mi.Point3f(lattice.points(mi.Float))
     source = points
     for _ in range(_INVERSIONS):
-        source = points - mi.Vector3f(*offsets.eval(texel(source)))
+        source = points - mi.Vector3f(*offsets.channels(source))
         dr.eval(source)
-    return dr.ravel(mi.ArrayXf(values.eval(texel(source))))
+    return values(source)

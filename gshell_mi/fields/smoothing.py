@@ -9,39 +9,45 @@ from cholespy import CholeskySolverF, MatrixType
 from scipy.sparse import coo_matrix, eye
 from scipy.sparse.csgraph import laplacian
 
+from ..block_lattice import BlockLattice
+from ..lattice import Lattice
+from ..sign_scan import MISSING
+
 
 class LatticeDiffusion:
     """Approximates ``(I + smoothing L)^-1`` with the lattice's 6-neighbour Laplacian L.
 
     Damped Jacobi iterations: they reach no farther than ``iterations`` cells, which is all that a
     preconditioner needs, and each is one small kernel. There is no flow through the boundary, so a
-    constant field stays as it is.
+    constant field stays as it is. The edge of the blocks of a ``BlockLattice`` is such a boundary: what would
+    have passed it stays inside.
 
     Args:
-        stride: lattice vertices per side; fields have ``stride**3`` values, x fastest.
+        lattice: the fields have one value, or several channels, per vertex of it.
         iterations: Jacobi iterations.
     """
 
-    def __init__(self, stride: int, iterations: int = 12):
+    def __init__(self, lattice: Lattice | BlockLattice, iterations: int = 12):
         self.iterations = iterations
-        index = dr.arange(mi.UInt32, stride**3)
-        n = dr.opaque(mi.UInt32, stride)
-        row = index // n
-        z = row // n
-        x, y = index - row * n, row - z * n
-        # A missing neighbour is the vertex itself.
-        self._neighbours = []
-        for coordinate, step in ((x, dr.opaque(mi.UInt32, 1)), (y, n), (z, n * n)):
-            self._neighbours.append(dr.select(coordinate > 0, index - step, index))
-            self._neighbours.append(dr.select(coordinate + 1 < n, index + step, index))
-        dr.eval(self._neighbours)
-        self._count = stride**3
+        self._lattice = lattice
+        self._count = lattice.vertex_count
+        self._neighbours = None if isinstance(lattice, BlockLattice) else _neighbours(lattice)
+
+    def _around(self) -> list[mi.UInt32]:
+        """The six neighbours of each vertex; a missing one is the vertex itself."""
+        if self._neighbours:
+            return self._neighbours
+        # Found anew each time: the tables of rows are small, the neighbours of all vertices are not.
+        vertex = dr.arange(mi.UInt32, self._count)
+        found = (self._lattice.neighbour(vertex, mi.UInt32(axis), mi.Bool(up))
+                 for axis in range(3) for up in (False, True))
+        return [dr.select(neighbour == MISSING, vertex, neighbour) for neighbour in found]
 
     def __call__(self, field: mi.Float, smoothing: float) -> mi.Float:
         """Diffuses a flat field of one value, or of interleaved channels, per lattice vertex.
 
         Args:
-            field: ``Float`` with ``channels * stride**3`` values, (r0, g0, b0, r1, ...) for three.
+            field: ``Float`` with one value per vertex, or three: (r0, g0, b0, r1, ...).
             smoothing: lambda; 0 returns the field as it is.
         """
         if smoothing == 0:
@@ -51,7 +57,7 @@ class LatticeDiffusion:
         known, weight = dr.unravel(kind, field), dr.opaque(mi.Float, smoothing)
         solution = field
         for _ in range(self.iterations):
-            total = sum(dr.gather(kind, solution, neighbour) for neighbour in self._neighbours)
+            total = sum(dr.gather(kind, solution, neighbour) for neighbour in self._around())
             solution = dr.ravel((known + weight * total) / (1 + 6 * weight))
             dr.eval(solution)
         return solution
@@ -77,6 +83,20 @@ class LatticeDiffusion:
         total = dr.select(original_here, values, self(values, smoothing))
         known = original | reached
         return dr.select(original_here | reached_here, total / divisor, 0), known
+
+
+def _neighbours(lattice: Lattice) -> list[mi.UInt32]:
+    index = dr.arange(mi.UInt32, lattice.vertex_count)
+    n = dr.opaque(mi.UInt32, lattice.stride)
+    row = index // n
+    z = row // n
+    x, y = index - row * n, row - z * n
+    neighbours = []
+    for coordinate, step in ((x, dr.opaque(mi.UInt32, 1)), (y, n), (z, n * n)):
+        neighbours.append(dr.select(coordinate > 0, index - step, index))
+        neighbours.append(dr.select(coordinate + 1 < n, index + step, index))
+    dr.eval(neighbours)
+    return neighbours
 
 
 class MeshDiffusion:

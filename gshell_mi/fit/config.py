@@ -30,6 +30,11 @@ class FitConfig:
     """Seed of every random number of the fit."""
     resolution: int | None = None
     """Cells per side of the lattice; default: that of the scene's gshell shape (64)."""
+    start_resolution: int = 64
+    """Cells per side, at most, up to the joint stage, which interpolates what it starts from. Unused if the
+    scene gives the fields."""
+    band_resolution: int = 128
+    """From this resolution on the joint stage stores its fields in blocks around the surface."""
     checkpoint_seconds: float = 10.0
     """Seconds between checkpoints: what a kill loses at most."""
     triptychs: int = 16
@@ -185,8 +190,10 @@ class FitConfig:
                      "triptychs"):
             if getattr(self, name) < 1:
                 raise UserError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}.")
-        if self.resolution is not None and self.resolution < 4:
-            raise UserError(f"--resolution must be at least 4 cells, not {self.resolution}.")
+        for name in ("resolution", "start_resolution"):
+            cells = getattr(self, name)
+            if cells is not None and cells < 4:
+                raise UserError(f"--{name.replace('_', '-')} must be at least 4 cells, not {cells}.")
         if self.checkpoint_seconds < 0:
             raise UserError(f"--checkpoint-seconds must not be negative, and is {self.checkpoint_seconds:g}.")
         for name in ("iterations", "refinement_iterations"):

@@ -17,6 +17,9 @@ from .config import FitConfig
 from .observer import Preview
 from .regularisers import Regularisers
 
+#: Steps after which blocks that the surface has left are dropped.
+_RESCAN = 50
+
 
 class JointStage:
     """Adam on what parametrises the lattice fields, the material and the environment map.
@@ -47,7 +50,7 @@ class JointStage:
             self.subject.shade_flat()
         self._integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
                                          "reparam_depth": config.reparam_depth, "hide_emitters": True})
-        self._diffuse = LatticeDiffusion(self.subject.lattice.stride)
+        self._diffuse = LatticeDiffusion(self.subject.lattice)
         moving = [name for name in self.subject.field_names if name != "msdf" or not config.watertight]
         start = {name: self.parameters[f"subject.{name}"] for name in moving}
         rules = StepRules(config.geometry_lr, config.deform_lr, config.geometry_smoothing,
@@ -94,6 +97,7 @@ class JointStage:
                 gradients = {name: dr.grad(field) for name, field in self.fields.items()}
                 self.geometry.step(gradients, progress, iteration)
             self._step_shading(0.1**progress)
+        self._follow_surface(rescan=(iteration + 1) % _RESCAN == 0)
         error = dr.mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]), axis=None)
         return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
                 **{name: value[0] for name, value in terms.items()},
@@ -132,6 +136,16 @@ class JointStage:
             self.light.log_radiance = self.shading["light"]
             self.light.update(self.parameters)
         self.parameters.update()
+
+    def _follow_surface(self, *, rescan: bool) -> None:
+        """Moves the blocks that the fields are stored in, and all that is stored with them."""
+        carried = self.subject.follow(rescan=rescan)
+        if carried is None:
+            return
+        self.geometry.carry(carried)
+        carried.optimizer(self.shading, self.material.parameters)
+        self.material.carry(carried)
+        self._diffuse = LatticeDiffusion(carried.after)
 
     def _step_shading(self, decay: float) -> None:
         config, optimizer = self.config, self.shading

@@ -51,11 +51,15 @@ class MemoryEstimate:
         >>> many.total - few.total == many.targets - few.targets > 0
         True
         """
+        # Fields in blocks follow the surface.
+        whole = resolution
+        if resolution >= config.band_resolution:
+            whole = min(resolution, config.start_resolution)
         pixels = np.asarray(sizes, np.int64).prod(axis=1)
         votes = config.hull_daylight_votes * len(pixels)
         return cls(
             program=_PROGRAM + (_ASSET if report else 0),
-            lattice=int((_PER_VERTEX + _PER_VOTE * votes) * (resolution + 1) ** 3
+            lattice=int((_PER_VERTEX + _PER_VOTE * votes) * (whole + 1) ** 3
                         + _PER_SQUARE_CELL * resolution**2),
             targets=_PER_PIXEL * int(pixels.sum()),
             samples=_PER_SAMPLE * int(pixels.max()) * max(config.primal_spp, config.spp))

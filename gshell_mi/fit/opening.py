@@ -106,4 +106,4 @@ def splat_to_lattice(values: mi.Float, template: SurfaceMesh,
             for channel in range(channels):
                 value = dr.gather(mi.Float, values, channels * vertex + channel)
                 dr.scatter_reduce(dr.ReduceOp.Add, total, share * value, channels * end + channel)
-    return LatticeDiffusion(lattice.stride).extend(total, weight)
+    return LatticeDiffusion(lattice).extend(total, weight)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -44,13 +44,16 @@ from .pixels import PixelPool
 from .progress import Progress
 from .radiance_ghost import RadianceGhost
 from .refinement import PhotometricRefinement
-from .start import TYPICAL_REFLECTANCE, check_given, start_fields, start_light, start_material
+from .start import TYPICAL_REFLECTANCE, block_arrays, check_given, start_fields, start_light, start_material
 
 #: What the joint stage starts from.
 _SURFACE = ("sdf", "msdf", "radiance", "known")
 
 #: Every eighth view is kept from the refinement and judges it.
 _HOLD_OUT = 8
+
+#: Between two checkpoints at least this many times what writing one takes.
+_CHECKPOINT_PAUSE = 10
 
 #: Parts of the refinement's displacement that are tried until one does not tear the surface.
 _FRACTIONS = (1.0, 0.8, 0.6, 0.4, 0.2)
@@ -121,7 +124,10 @@ class _Fit:
         if not all(target.has_alpha for target in self.scene.targets):
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
         given = self.scene.subject.lattice
-        self.lattice = make_lattice(given.grid, config.resolution or given.resolution)
+        self.resolution = config.resolution or given.resolution
+        # Given fields may have detail that no coarser lattice holds.
+        coarse = self.resolution if self.scene.subject.filename else config.start_resolution
+        self.lattice = make_lattice(given.grid, min(self.resolution, coarse))
         self.pixels = PixelPool(self.views, self.scene.targets)
         # Nothing of an earlier fit goes before all is known to be in order.
         make_output_folder(output, keep=resume)
@@ -314,12 +320,14 @@ class _Fit:
 
     def _joint(self) -> JointStage:
         start = dict(self.checkpoint.arrays)
-        self.scene.subject.set_fields(start_fields(start, self.lattice.grid))
-        joint = JointStage(self.scene, start_material(self.scene, start, self.config),
+        fields = start_fields(start, make_lattice(self.lattice.grid, self.resolution), self.config)
+        self.scene.subject.set_fields(fields)
+        joint = JointStage(self.scene, start_material(self.scene, start, fields.lattice, self.config),
                            start_light(self.scene, start, self.config), self.config)
         self._fit_field(joint)
         if self.checkpoint.stage == "joint":
-            self._iterate("joint", self.config.iterations, joint, joint.optimizers, start)
+            self._iterate("joint", self.config.iterations, joint, joint.optimizers, start,
+                          lambda: block_arrays(self.scene.subject.fields()))
         else:
             for name, optimizer in joint.optimizers.items():
                 restore_optimizer(name, optimizer, self.checkpoint.arrays)
@@ -365,7 +373,8 @@ class _Fit:
 
     def _iterate(self, stage: str, count: int,
                  worker: RadianceGhost | PhotometricRefinement | FieldFitting | JointStage,
-                 optimizers: Mapping[str, mi.ad.Adam], constants: dict[str, np.ndarray]) -> None:
+                 optimizers: Mapping[str, mi.ad.Adam], constants: dict[str, np.ndarray],
+                 variables: Callable[[], dict[str, np.ndarray]] = dict) -> None:
         """Runs the steps of a stage that are left, logging each and saving a checkpoint now and then."""
         first = self.checkpoint.iteration
         if first > 0:
@@ -374,14 +383,14 @@ class _Fit:
         constants = {name: constants[name] for name in constants if "/" not in name}
 
         def save(done: int) -> None:
-            arrays = dict(constants)
+            arrays = constants | variables()
             for name, optimizer in optimizers.items():
                 arrays |= optimizer_arrays(name, optimizer)
             self.checkpoint.iteration, self.checkpoint.arrays = done, arrays
             self.checkpoint.save(self.path)
 
         with self.progress.stage(stage, count, first) as advance:
-            saved = time.monotonic()
+            saved, pause = time.monotonic(), self.config.checkpoint_seconds
             for iteration in range(first, count):
                 begin = time.monotonic()
                 self.interrupt.check()
@@ -392,9 +401,11 @@ class _Fit:
                 if self.observer:
                     self.observer.step(stage, iteration, count, values, worker.preview)
                 self._spent(stage, time.monotonic() - begin)
-                if time.monotonic() - saved > self.config.checkpoint_seconds:
+                if time.monotonic() - saved > pause:
+                    begin = time.monotonic()
                     save(iteration + 1)
                     saved = time.monotonic()
+                    pause = max(self.config.checkpoint_seconds, _CHECKPOINT_PAUSE * (saved - begin))
         save(count)
 
     def _enter(self, stage: str, **arrays: np.ndarray) -> None:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import mitsuba as mi
 import numpy as np
 
+from ..block_lattice import BlockLattice
 from ..errors import UserError
 from ..fields import LatticeFields
+from ..fields.interpolation import Interpolation
+from ..lattice import Lattice, make_lattice
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, given_material
 from ..scene import FitScene
@@ -15,6 +19,11 @@ from .config import FitConfig
 
 #: Median reflectance that the first split of radiance into material and light assumes.
 TYPICAL_REFLECTANCE = 0.5
+
+#: Share of the surrounding vertices that have a radiance, from which a point between them has one.
+_KNOWN = 0.1
+
+_BAND = "band/"
 
 
 def check_given(scene: FitScene, config: FitConfig) -> None:
@@ -30,20 +39,41 @@ def check_given(scene: FitScene, config: FitConfig) -> None:
                         f"metallic.")
 
 
-def start_fields(arrays: Mapping[str, np.ndarray], grid: str) -> LatticeFields:
-    """The fields that the earlier stages left."""
+def start_fields(arrays: Mapping[str, np.ndarray], lattice: Lattice, config: FitConfig) -> LatticeFields:
+    """The fields that earlier stages left, or a checkpoint of the joint stage in blocks, on ``lattice``."""
+    if f"{_BAND}blocks" in arrays:
+        stored = {name: arrays[f"{_BAND}{name}"] for name in ("sdf", "msdf", "deform", "blocks")}
+        return LatticeFields(**stored, grid=lattice.grid, block_resolution=lattice.resolution)
     deform = arrays.get("deform", np.zeros(3 * arrays["sdf"].size, np.float32))
-    return LatticeFields(arrays["sdf"], arrays["msdf"], deform, grid=grid)
+    fields = LatticeFields(arrays["sdf"], arrays["msdf"], deform, grid=lattice.grid)
+    if lattice.resolution >= config.band_resolution:
+        return fields.in_blocks(lattice.resolution)
+    return fields if fields.lattice == lattice else fields.to_lattice(lattice.resolution)
 
 
-def start_material(scene: FitScene, arrays: Mapping[str, np.ndarray],
+def block_arrays(fields: LatticeFields) -> dict[str, np.ndarray]:
+    """What a checkpoint keeps of fields in blocks, for ``start_fields``; nothing of others."""
+    if fields.blocks is None:
+        return {}
+    return {f"{_BAND}{name}": getattr(fields, name) for name in ("sdf", "msdf", "deform", "blocks")}
+
+
+def start_material(scene: FitScene, arrays: Mapping[str, np.ndarray], lattice: Lattice | BlockLattice,
                    config: FitConfig) -> MaterialField | GivenMaterial:
     """The scene's own material or, as a field, what is known of it and the colours that the ghost saw."""
     given = given_material(scene.bsdf)
     if config.material_is_given:
-        return GivenMaterial(len(arrays["known"]), **given)
-    seen = arrays["radiance"] / arrays["light"]
-    reflectance = np.where(arrays["known"][:, None], seen, TYPICAL_REFLECTANCE)
+        return GivenMaterial(lattice.vertex_count, **given)
+    radiance, known = arrays["radiance"], arrays["known"]
+    seen_on = make_lattice(lattice.grid, round(len(known) ** (1 / 3)) - 1)
+    if seen_on != lattice:
+        points = lattice.points(mi.Float)
+        share = Interpolation(mi.Float(known.astype(np.float32)), seen_on)(points).numpy()
+        # Where nothing is known the radiance is 0.
+        total = Interpolation(mi.Float(radiance.astype(np.float32).ravel()), seen_on)(points).numpy()
+        known = share > _KNOWN
+        radiance = total.reshape(-1, 3) / np.maximum(share, _KNOWN)[:, None]
+    reflectance = np.where(known[:, None], radiance / arrays["light"], TYPICAL_REFLECTANCE)
     return MaterialField(reflectance, **given)
 
 

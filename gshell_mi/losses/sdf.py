@@ -5,12 +5,14 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..block_lattice import BlockLattice
 from ..extraction.surface_mesh import gather
 from ..lattice import Lattice
+from ..sign_scan import MISSING
 from .reduction import mean_where
 
 
-def sign_cross_entropy(sdf: mi.Float, lattice: Lattice) -> mi.Float:
+def sign_cross_entropy(sdf: mi.Float, lattice: Lattice | BlockLattice) -> mi.Float:
     """Mean over the crossed lattice edges (a, b) of ``H(σ(s_a), sign s_b) + H(σ(s_b), sign s_a)``.
 
     Binary cross-entropy H that pulls the signs of neighbours together: sign changes that nothing supports,
@@ -28,7 +30,7 @@ def sign_cross_entropy(sdf: mi.Float, lattice: Lattice) -> mi.Float:
     return total / dr.maximum(count, 1)
 
 
-def eikonal(sdf: mi.Float, lattice: Lattice, reach: float = 3.0) -> mi.Float:
+def eikonal(sdf: mi.Float, lattice: Lattice | BlockLattice, reach: float = 3.0) -> mi.Float:
     """Mean of ``(|grad s| - 1)^2`` by forward differences, over the vertices near the surface.
 
     A distance has slope 1 (Gropp et al. 2020); a field that forgets this gets cliffs, which cannot move, and
@@ -53,8 +55,15 @@ def eikonal(sdf: mi.Float, lattice: Lattice, reach: float = 3.0) -> mi.Float:
     return mean_where(near, dr.square(dr.sqrt(dr.maximum(squared_slope, 1e-8)) - 1))
 
 
-def _axis_edges(sdf: mi.Float, lattice: Lattice):
+def _axis_edges(sdf: mi.Float, lattice: Lattice | BlockLattice):
     """Per axis the values at each vertex and at its next neighbour, and whether that exists."""
+    if isinstance(lattice, BlockLattice):
+        vertex = dr.arange(mi.UInt32, lattice.vertex_count)
+        for axis in range(3):
+            neighbour = lattice.neighbour(vertex, mi.UInt32(axis), mi.Bool(True))
+            exists = (neighbour != MISSING) & lattice.in_lattice(vertex)
+            yield sdf, gather(mi.Float, sdf, dr.select(exists, neighbour, vertex)), exists
+        return
     stride = dr.opaque(mi.UInt32, lattice.stride)
     vertex = dr.arange(mi.UInt32, lattice.vertex_count)
     row = vertex // stride

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import drjit as dr
 import mitsuba as mi
 
+from ..block_lattice import BlockLattice
+from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
 from .parametrisation import CHANNELS, Parametrisation, StepRules, finite
@@ -23,9 +25,9 @@ class ExplicitGrid(Parametrisation):
         start: fields to start from, any of ``sdf``, ``msdf``, ``deform``, ``weights``.
     """
 
-    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice, rules: StepRules):
+    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules):
         self.lattice, self.rules = lattice, rules
-        self._diffuse = LatticeDiffusion(lattice.stride)
+        self._diffuse = LatticeDiffusion(lattice)
         self.optimizer = mi.ad.Adam(lr=rules.rate, uniform=True)
         for name, field in start.items():
             self.optimizer[name] = mi.Float(field)
@@ -36,6 +38,10 @@ class ExplicitGrid(Parametrisation):
 
     def fields(self) -> dict[str, mi.Float]:
         return {name: mi.Float(dr.detach(self.optimizer[name])) for name in self.optimizer.keys()}
+
+    def carry(self, carried: Carried) -> None:
+        carried.optimizer(self.optimizer, tuple(self.optimizer.keys()))
+        self.lattice, self._diffuse = carried.after, LatticeDiffusion(carried.after)
 
     def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0) -> None:
         rules, optimizer = self.rules, self.optimizer

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import mitsuba as mi
 
+from ..block_lattice import BlockLattice
 from ..errors import UserError
 from ..lattice import Lattice
 from .explicit import ExplicitGrid
@@ -21,7 +22,7 @@ _NETWORKS = {"hashgrid": HashGridNetwork, "sinusoidal": SinusoidalNetwork}
 PARAMETRISATIONS: tuple[str, ...] = (*_GRIDS, *_NETWORKS)
 
 
-def make_parametrisation(name: str, start: Mapping[str, mi.Float], lattice: Lattice,
+def make_parametrisation(name: str, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice,
                          rules: StepRules | None = None, *, seed: int = 0) -> Parametrisation:
     """The parametrisation ``name``, one of ``PARAMETRISATIONS``, of the fields of a lattice.
 

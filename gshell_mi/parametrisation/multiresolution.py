@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import drjit as dr
 import mitsuba as mi
 
+from ..block_lattice import BlockLattice
+from ..fields.carried import Carried
 from ..lattice import Lattice
 from .explicit import ExplicitGrid
 from .parametrisation import CHANNELS, Parametrisation, StepRules, finite, taken, touched
@@ -23,7 +25,7 @@ class MultiresolutionGrid(Parametrisation):
     levels start at 0, so the fields start exactly where they are told to.
     """
 
-    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice, rules: StepRules):
+    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules):
         self.lattice, self.rules = lattice, rules
         sizes = (max(lattice.resolution >> level, 1) + 1 for level in range(1, _COARSE_LEVELS + 1))
         self._sizes = list(dict.fromkeys(sizes))
@@ -48,6 +50,13 @@ class MultiresolutionGrid(Parametrisation):
         fields["deform"] = dr.clip(fields["deform"], -1, 1)
         dr.eval(fields)
         return fields | (self._cubes.fields() if self._cubes else {})
+
+    def carry(self, carried: Carried) -> None:
+        # The lattice's own level holds the start, which is nearly all of the field.
+        carried.optimizer(self.optimizer, self._names)
+        self.lattice = carried.after
+        if self._cubes:
+            self._cubes.carry(carried)
 
     def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0) -> None:
         rules, optimizer = self.rules, self.optimizer

@@ -10,6 +10,8 @@ import mitsuba as mi
 import numpy as np
 from drjit import nn
 
+from ..block_lattice import BlockLattice
+from ..fields.carried import Carried
 from ..lattice import Lattice
 from .explicit import ExplicitGrid
 from .parametrisation import CHANNELS, Parametrisation, StepRules, finite, taken, touched
@@ -56,7 +58,8 @@ class NetworkFields(Parametrisation):
     fitting_rate: float
     """Adam's first step of the fit to the start; falls hundredfold."""
 
-    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice, rules: StepRules, seed: int):
+    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice,
+                 rules: StepRules, seed: int):
         self.lattice, self.rules, self.seed = lattice, rules, seed
         self._start = {name: mi.Float(start[name]) for name in ("sdf", "msdf", "deform") if name in start}
         self._near = dr.compress(dr.abs(self._start["sdf"]) < _NEAR_CELLS * lattice.spacing)
@@ -93,6 +96,11 @@ class NetworkFields(Parametrisation):
     def begin(self) -> None:
         self.attach()
         self._begin(self.rate)
+
+    def carry(self, carried: Carried) -> None:
+        self.lattice = carried.after
+        if self._cubes:
+            self._cubes.carry(carried)
 
     # --- evaluation
 

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..extraction.surface_mesh import gather
+from ..fields.carried import Carried
 
 #: Values per lattice vertex of the fields that live there; the weights of FlexiCubes belong to cubes.
 CHANNELS = {"sdf": 1, "msdf": 1, "deform": 3}
@@ -68,6 +69,10 @@ class Parametrisation(ABC):
             progress: in [0, 1], of the whole fit.
             iteration: seeds what a step draws at random.
         """
+
+    @abstractmethod
+    def carry(self, carried: Carried) -> None:
+        """Moves what is stored per vertex to other blocks of the lattice, see ``BlockLattice``."""
 
     def fit_step(self, iteration: int) -> dict[str, float]:
         """One step towards the fields to start from; returns the losses."""

@@ -1,3 +1,5 @@
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -80,3 +82,35 @@ def test_resampling_keeps_linear_fields_and_lengths(resolution):
 def test_sphere_must_fit(radius):
     with pytest.raises(UserError, match="between 0 and 1, not be"):
         sphere(TetLattice(4), radius)
+
+
+@pytest.mark.parametrize("resolution", [16, 40, 70])
+def test_fields_in_blocks_are_those_of_the_whole_lattice(resolution):
+    """Of this lattice or, where they are linear, of a finer one."""
+    old = TetLattice(16)
+    p = old.vertex_positions()
+    offset = (0.3 * p).astype(np.float32)
+    fields = LatticeFields(p[:, 1] - np.float32(0.31), p @ np.float32([1, 2, 3]), offset.ravel())
+    stored = fields.in_blocks(None if resolution == 16 else resolution)
+    whole = fields.to_lattice(resolution)
+    lattice = stored.lattice
+    assert lattice.resolution == resolution and (resolution == 16 or lattice.fraction < 0.61)
+    for name in ("sdf", "msdf", "deform"):
+        expected = lattice.take(mi.Float(getattr(whole, name))).numpy()
+        inside = lattice.in_lattice(dr.arange(mi.UInt32, lattice.vertex_count)).numpy()
+        inside = inside.repeat(len(expected) // len(inside))
+        np.testing.assert_allclose(getattr(stored, name)[inside], expected[inside], atol=2e-5)
+
+
+def test_fields_in_blocks_and_files(tmp_path):
+    fields = sphere(TetLattice(40), 0.41, in_blocks=True)
+    np.testing.assert_array_equal(fields.blocks, sphere(TetLattice(40), 0.41).in_blocks().blocks)
+    fields.save(tmp_path / "a.npz")
+    again = LatticeFields.load(tmp_path / "a.npz")
+    assert again.lattice.resolution == 40 and again.lattice.vertex_count == again.sdf.size
+    np.testing.assert_array_equal(again.sdf, fields.sdf)
+    with pytest.raises(UserError, match="fields in blocks are known near their surface only"):
+        fields.to_lattice(20)
+    np.savez(tmp_path / "b.npz", sdf=fields.sdf[1:], blocks=fields.blocks, block_resolution=40)
+    with pytest.raises(UserError, match=rf"sdf has {fields.sdf.size - 1} values, but its blocks have"):
+        LatticeFields.load(tmp_path / "b.npz").lattice  # noqa: B018

@@ -7,6 +7,7 @@ import pytest
 from closed_form import value
 
 from gshell_mi import losses
+from gshell_mi.block_lattice import BlockLattice
 from gshell_mi.lattice import TetLattice
 
 LATTICE = TetLattice(12)
@@ -77,3 +78,12 @@ def test_derivatives_agree_with_finite_differences(loss):
     step = 2e-3
     up, down = (value(loss(start + sign * step * direction, LATTICE)) for sign in (1, -1))
     assert along == pytest.approx((up - down) / (2 * step), rel=0.02, abs=1e-4)
+
+
+def test_same_in_blocks_around_the_surface():
+    lattice = TetLattice(40)
+    points = lattice.points(mi.Float)
+    sdf = (dr.norm(points) - 0.5 + 0.02 * dr.sin(20 * points.x)) / lattice.spacing
+    blocks = BlockLattice.around(lattice, sdf)
+    for loss in (losses.sign_cross_entropy, lambda s, on: losses.eikonal(s, on, reach=2.0)):
+        np.testing.assert_allclose(loss(blocks.take(sdf), blocks)[0], loss(sdf, lattice)[0], rtol=1e-5)
