@@ -102,7 +102,7 @@ def test_geometry_only_shades_faces_flat(scene):
     arrays = {"known": np.zeros(count, bool), "radiance": np.zeros((count, 3)), "light": 1.0}
     config = FitConfig(geometry_only=True)
     assert start_light(loaded, arrays, config) is None
-    joint = JointStage(loaded, start_material(loaded, arrays, config), None, config)
+    joint = JointStage(loaded, start_material(loaded, arrays, loaded.subject.lattice, config), None, config)
     hit = joint.scene.ray_intersect(mi.Ray3f(mi.Point3f([0.1, 0.2], [0.05, 0.1], 3), mi.Vector3f(0, 0, -1)))
     np.testing.assert_allclose(np.array(hit.sh_frame.n), np.array(hit.n), atol=1e-6)
 
