@@ -51,10 +51,11 @@ def mean_and_error(values):
     return values.mean(), values.std(ddof=1) / np.sqrt(len(values))
 
 
-def repeat(draw, values, goal, seconds, least=6):
+def repeat(draw, values, goal, seconds, least=24):
     """Appends ``draw(seed)`` to ``values`` until the standard error is ``goal`` of the mean, or time is up.
 
-    The time is processor time after the first call, which compiles.
+    The time is processor time after the first call, which compiles. Fewer than ``least`` values would stop
+    too early by chance: where they happen to lie close together.
     """
     start = None
     while True:
