@@ -150,3 +150,13 @@ class LatticeFields:
             if size != needed:
                 raise UserError(f"{path}: {name} has {size} values, but sdf needs {needed} of them")
         return fields
+
+
+def closed_at_border(sdf: np.ndarray, lattice: Lattice) -> np.ndarray:
+    """A signed distance field made finite, and outside at the cube's faces: its template is watertight."""
+    n = lattice.stride
+    grid = np.clip(sdf, -1.0, 1.0).reshape(n, n, n).astype(np.float32)
+    for axis in range(3):
+        ends = np.moveaxis(grid, axis, 0)
+        ends[[0, -1]] = np.maximum(ends[[0, -1]], 0.5 * lattice.spacing)
+    return grid.ravel()

@@ -95,10 +95,10 @@ class FitConfig:
     """Lambda at the end; falls geometrically."""
     refinement_radiance_lr: float = 0.05
     """Adam's step for the radiance meanwhile."""
-    refinement_outline: float = 0.0003
+    refinement_outline: float = 0.001
     """Weight of the squared distance, in cells, between silhouettes and masks; falls to half."""
 
-    refinement_gain: float = 0.85
+    refinement_gain: float = 0.9
     """The refinement is kept if it brings the image error of views that it did not see below this fraction.
     Where radiance depends much on the view (gloss), it may explain the views it sees by a wrong shape."""
 
@@ -106,7 +106,7 @@ class FitConfig:
     field: Literal["explicit", "multiresolution", "hashgrid", "sinusoidal"] = "explicit"
     """What the geometry is optimised as: the lattice's values themselves, sums of grids of several
     resolutions, a hash grid with a small network, or a sinusoidal network."""
-    iterations: int = 200
+    iterations: int = 300
     """Steps of the joint stage."""
     warmup: float = 0.15
     """Fraction of these steps in which only material and light move."""

@@ -15,6 +15,7 @@ from ..scene import FitScene
 from ..timing import phase
 from .config import FitConfig
 from .observer import Preview
+from .opening import without_specks
 from .regularisers import Regularisers
 
 #: Steps after which blocks that the surface has left are dropped.
@@ -104,8 +105,12 @@ class JointStage:
                 "psnr": -10 * float(np.log10(max(error.array[0], 1e-10)))}
 
     def finish(self) -> None:
-        """Leaves the last step's parameters in the scene."""
+        """Leaves the last step's parameters in the scene, without what noise has cut out or left floating."""
         self._apply(geometry=True)
+        subject = self.subject
+        self.parameters["subject.msdf"] = without_specks(subject.msdf, subject.template(), subject.lattice,
+                                                         self.config.ghost_min_area)
+        self.parameters.update()
 
     def preview(self) -> Preview:
         """The mesh of the last step in its base colour."""

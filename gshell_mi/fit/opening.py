@@ -16,6 +16,9 @@ from ..topology import vertex_components
 #: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
 _CERTAIN = 3.0
 
+#: What a speck leaves at its neighbours when it goes may be the next one.
+_CLEANINGS = 4
+
 
 def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, min_area: float) -> np.ndarray:
     """Undoes the cuts and the islands that are too small to be meant.
@@ -94,16 +97,44 @@ def splat_to_lattice(values: mi.Float, template: SurfaceMesh,
     Each lattice vertex takes the mean of the template vertices on its edges, weighted as they
     interpolate it; its surroundings are extended from there.
 
+    Args:
+        values: one value or three interleaved channels per vertex of the template.
+        template: a surface with its stencil.
+        lattice: what it was extracted from.
+
     Returns:
         The field, and a mask of the lattice vertices that have a value.
     """
+    total, weight = _splat(values, template, lattice, dr.full(mi.Bool, True, template.vertex_count))
+    return LatticeDiffusion(lattice).extend(total, weight)
+
+
+def without_specks(msdf: mi.Float, template: SurfaceMesh, lattice: Lattice, min_area: float) -> mi.Float:
+    """ν without the cuts and the islands that are too small to be meant, see ``clean_opacity``."""
+    vertices, faces, _ = template.to_numpy()
+    msdf = dr.detach(msdf)
+    for _ in range(_CLEANINGS):
+        values = template.interpolate(msdf).numpy()
+        cleaned = clean_opacity(values, vertices, faces, min_area)
+        if (cleaned == values).all():
+            break
+        # Only what flips is written anew: on its way over the mesh and back a field loses its details.
+        total, weight = _splat(mi.Float(cleaned), template, lattice, mi.Bool(cleaned != values))
+        msdf = dr.select(weight > 0, total / dr.maximum(weight, 1e-12), msdf)
+    return msdf
+
+
+def _splat(values: mi.Float, template: SurfaceMesh, lattice: Lattice,
+           counted: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    """Sums, over the counted vertices of the template, of weighted values and of weights."""
     channels = dr.width(values) // template.vertex_count
     total = dr.zeros(mi.Float, channels * lattice.vertex_count)
     weight = dr.zeros(mi.Float, lattice.vertex_count)
     with dr.suspend_grad():
         for vertex, end, share in dr.detach(template.stencil.entries()):
+            share = dr.select(dr.gather(mi.Bool, counted, vertex), share, 0)
             dr.scatter_reduce(dr.ReduceOp.Add, weight, share, end)
             for channel in range(channels):
                 value = dr.gather(mi.Float, values, channels * vertex + channel)
                 dr.scatter_reduce(dr.ReduceOp.Add, total, share * value, channels * end + channel)
-    return LatticeDiffusion(lattice).extend(total, weight)
+    return total, weight

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..fields.visual_hull import mask_distance
 from ..views import PinholeViews
+from .mesh_normals import vertex_normals
 
 #: A contour point belongs to the outer silhouette if the ray this many pixels beyond it meets nothing.
 _CLEARANCE = 1.5
@@ -60,7 +61,7 @@ class Outlines:
         lane = dr.arange(mi.UInt32, len(chosen) * self._edge_count)
         view = dr.gather(mi.UInt32, mi.UInt32(chosen), lane // count)
         edge = dr.gather(mi.Vector2u, self._edges, lane % count)
-        normals = self._vertex_normals(dr.detach(positions))
+        normals = vertex_normals(dr.detach(positions), self._faces)
         origin = self.views.origins_of(view)
         with dr.suspend_grad():
             ends = [dr.gather(mi.Point3f, positions, edge[i]) for i in range(2)]
@@ -94,11 +95,3 @@ class Outlines:
         corner = dr.gather(mi.UInt32, self._first, view) + mi.UInt32(row) * width + mi.UInt32(column)
         texel = [dr.gather(mi.Float, self._distances, corner + step) for step in (0, 1, width, width + 1)]
         return dr.lerp(dr.lerp(texel[0], texel[1], fx), dr.lerp(texel[2], texel[3], fx), fy)
-
-    def _vertex_normals(self, positions: mi.Float) -> mi.Float:
-        a, b, c = (dr.gather(mi.Point3f, positions, self._faces[i]) for i in range(3))
-        normal = dr.cross(b - a, c - a)  # weighted by area
-        total = dr.zeros(mi.Float, 3 * self._vertex_count)
-        for corner in range(3):
-            dr.scatter_add(total, normal, self._faces[corner])
-        return total

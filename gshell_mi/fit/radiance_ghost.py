@@ -1,6 +1,7 @@
 """The radiance ghost: which parts of a template are surface, found without a light model.
 
-Every vertex of the watertight template carries an opacity and one radiance per side. A pixel's ray
+Every vertex of the watertight template carries an opacity and one radiance per side; a glossy lobe that all
+share adds what depends on the view. A pixel's ray
 composites the first few sheets that it meets front to back. Where the object is open (the neck of a
 T-shirt, the rim of a hat) no single radiance of the template's cap agrees with what the views see
 through it, so the cap fades and the inner side behind it takes over. As there is neither a light nor a
@@ -17,6 +18,8 @@ from .. import losses
 from ..fields.smoothing import MeshDiffusion
 from ..views import PinholeViews
 from .config import FitConfig
+from .glossy_lobe import PER_VERTEX, SHARED, initial_lobe, mirrored_radiance
+from .mesh_normals import vertex_normals
 from .observer import Preview
 from .pixels import PixelPool, PixelSample
 
@@ -36,6 +39,9 @@ _REFIT_STEPS, _ERROR_STEPS = 40, 20
 #: Random pixels of these steps must not depend on how many training steps came before.
 _EXTRA_STEP = 1 << 20
 
+#: The lobe learns slower than the radiance by this factor: it is to explain what that cannot.
+_LOBE_RATE = 0.4
+
 SIDES = ("front", "back")
 
 
@@ -48,21 +54,27 @@ class RadianceGhost:
         views: the cameras.
         pixels: the targets' pixels.
         config: ``ghost_*`` fields.
+        glossy: adds the lobe, for shapes. Openings are told apart better without: it explains a little of
+            everything, hence also of what is seen through a cap.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: PinholeViews, pixels: PixelPool,
-                 config: FitConfig):
-        self.views, self.pixels, self.config = views, pixels, config
+                 config: FitConfig, *, glossy: bool = False):
+        self.views, self.pixels, self.config, self.glossy = views, pixels, config, glossy
         self.vertex_count = len(vertices)
-        self._positions = mi.Float(vertices.ravel())
-        self._faces = mi.UInt32(faces.ravel())
-        self.scene = _scene(self._positions, self._faces, self.vertex_count, len(faces))
+        self._positions = mi.Float(vertices.ravel().astype(np.float32))
+        self._faces = mi.Vector3u(faces.T.astype(np.uint32))
+        self.scene = _scene(self._positions, dr.ravel(self._faces), self.vertex_count, len(faces))
         self._offset = 1e-4 * float(np.ptp(vertices, axis=0).max())
         self._smooth = MeshDiffusion(faces, self.vertex_count, config.ghost_smoothing)
         grey = _inverse_softplus(pixels.mean_radiance())
         self.optimizer = mi.ad.Adam(lr=config.ghost_lr)
         for side in SIDES:
             self.optimizer[side] = dr.full(mi.Float, grey, 3 * self.vertex_count)
+        if glossy:
+            for name, values in initial_lobe(self.vertex_count, pixels.mean_radiance()).items():
+                self.optimizer[name] = values
+            self._normals = self._smooth_normals()
         self._set_opacity(np.full(self.vertex_count, _INITIAL_LOGIT))
 
     def step(self, iteration: int) -> dict[str, float]:
@@ -127,7 +139,8 @@ class RadianceGhost:
         with dr.suspend_grad():
             for step in range(_ERROR_STEPS):
                 sample = pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
-                radiance, _ = self.composite(self._sheets(self.views.rays(sample.view, sample.film)))
+                ray = self.views.rays(sample.view, sample.film)
+                radiance, _ = self.composite(self._sheets(ray), ray.d)
                 total += losses.log_l1(radiance, sample.radiance)
                 dr.eval(total)
         return float(total[0]) / _ERROR_STEPS
@@ -135,6 +148,8 @@ class RadianceGhost:
     def move(self, positions: mi.Float) -> None:
         """Puts the vertices elsewhere: (3 V,) world positions, x0, y0, z0, x1, ..."""
         self._positions = positions
+        if self.glossy:
+            self._normals = self._smooth_normals()
         parameters = mi.traverse(self.scene)
         parameters["ghost.vertex_positions"] = positions
         parameters.update()
@@ -146,8 +161,8 @@ class RadianceGhost:
 
     def _render(self, step: int) -> tuple:
         """The random pixels of a step, their radiance and coverage, and the sheets behind them."""
-        sample, _, sheets = self.look(step)
-        return sample, *self.composite(sheets), sheets
+        sample, ray, sheets = self.look(step)
+        return sample, *self.composite(sheets, ray.d), sheets
 
     def look(self, step: int) -> tuple[PixelSample, mi.Ray3f, list[tuple]]:
         """The random pixels of a step, the rays through them and the sheets that these meet."""
@@ -156,13 +171,18 @@ class RadianceGhost:
         return sample, ray, self._sheets(ray)
 
     def update(self, names: tuple[str, ...], rate: float) -> None:
-        """Steps the parameters ``names`` along their Sobolev gradients; the others rest."""
-        rates = {name: rate if name in names else 0.0 for name in ("opacity", *SIDES)}
-        for name in rates:
+        """Steps the parameters ``names`` and the lobe; the others rest.
+
+        Values of the vertices move along their Sobolev gradients.
+        """
+        rates = dict.fromkeys(("opacity", *SIDES), 0.0) | dict.fromkeys(names, rate)
+        if self.glossy:
+            rates |= dict.fromkeys((*PER_VERTEX, *SHARED), _LOBE_RATE * rate)
+        for name, value in rates.items():
             parameter = self.optimizer[name]
-            gradient = dr.zeros(mi.Float, dr.width(parameter))
-            if name in names:
-                gradient = self._smooth(dr.grad(parameter))
+            gradient = dr.grad(parameter) if value else dr.zeros(mi.Float, dr.width(parameter))
+            if value and name not in SHARED:
+                gradient = self._smooth(gradient)
             dr.set_grad(parameter, gradient)
         self.optimizer.set_learning_rate(rates)
         self.optimizer.step()
@@ -193,7 +213,8 @@ class RadianceGhost:
         for _ in range(self.config.ghost_sheets):
             hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
             active = hit.is_valid()
-            face = dr.gather(mi.Vector3u, self._faces, hit.prim_index, active)
+            face = mi.Vector3u(*(dr.gather(mi.UInt32, corner, hit.prim_index, active)
+                                 for corner in self._faces))
             a, b, c = (dr.gather(mi.Point3f, self._positions, face[i], active) for i in range(3))
             front = dr.dot(dr.cross(b - a, c - a), ray.d) < 0
             # Barycentrics of a miss are not a number, and 0 times that is no 0.
@@ -203,22 +224,47 @@ class RadianceGhost:
         dr.eval(sheets)
         return sheets
 
-    def composite(self, sheets: list[tuple]) -> tuple[mi.Color3f, mi.Float]:
-        """Front-to-back compositing (Porter and Duff 1984, *over*) of radiance and coverage."""
-        opacity, front, back = (self.optimizer[name] for name in ("opacity", "front", "back"))
+    def composite(self, sheets: list[tuple], direction: mi.Vector3f) -> tuple[mi.Color3f, mi.Float]:
+        """Front-to-back compositing (Porter and Duff 1984, *over*) of radiance and coverage.
+
+        Args:
+            sheets: what the rays meet, from ``look``.
+            direction: of the rays.
+        """
+        opacity = self.optimizer["opacity"]
         radiance, transmittance = mi.Color3f(0), mi.Float(1)
-        for hit, face, weights, is_front in sheets:
+        for sheet in sheets:
+            hit, face, weights, is_front = sheet
             logit, color = mi.Float(0), mi.Color3f(0)
-            for corner in range(3):
-                logit += weights[corner] * dr.gather(mi.Float, opacity, face[corner], hit)
-                color += weights[corner] * (
-                    dr.gather(mi.Color3f, front, face[corner], hit & is_front)
-                    + dr.gather(mi.Color3f, back, face[corner], hit & ~is_front)
-                )
+            for weight, corner in zip(weights, face, strict=True):
+                logit += weight * dr.gather(mi.Float, opacity, corner, hit)
+                for side, seen in zip(SIDES, (hit & is_front, hit & ~is_front), strict=True):
+                    color += weight * dr.gather(mi.Color3f, self.optimizer[side], corner, seen)
             alpha = dr.select(hit, _sigmoid(logit), 0)
-            radiance += transmittance * alpha * _softplus(color)
+            color = _softplus(color)
+            if self.glossy:
+                color += self._mirrored(sheet, direction)
+            radiance += transmittance * alpha * color
             transmittance *= 1 - alpha
         return radiance, 1 - transmittance
+
+    def _mirrored(self, sheet: tuple, direction: mi.Vector3f) -> mi.Color3f:
+        """What the lobe adds to the radiance of a sheet."""
+        hit, face, weights, is_front = sheet
+        gloss, normal = mi.Float(0), mi.Vector3f(0)
+        for weight, corner in zip(weights, face, strict=True):
+            for side, seen in zip(PER_VERTEX, (hit & is_front, hit & ~is_front), strict=True):
+                gloss += weight * dr.gather(mi.Float, self.optimizer[side], corner, seen)
+            # The lobe is to explain highlights, not to turn the surface.
+            normal += dr.detach(weight) * dr.gather(mi.Vector3f, self._normals, corner, hit)
+        length = dr.norm(normal)
+        normal = dr.select(length > 1e-3, normal / length, -direction)
+        return mirrored_radiance(self.optimizer, gloss, dr.select(is_front, normal, -normal), direction, hit)
+
+    def _smooth_normals(self) -> mi.Float:
+        """(3 V,) unit normals, as smooth as the other values at the vertices."""
+        normals = dr.unravel(mi.Vector3f, self._smooth(vertex_normals(self._positions, self._faces)))
+        return dr.ravel(normals / dr.maximum(dr.norm(normals), 1e-12))
 
 
 def _scene(positions: mi.Float, faces: mi.UInt32, vertex_count: int, face_count: int) -> mi.Scene:

@@ -57,7 +57,7 @@ class PhotometricRefinement:
         sample, ray, sheets = ghost.look(iteration)
         attached = [(hit, face, _barycentric(positions, face, weights, ray, hit), front)
                     for hit, face, weights, front in sheets]
-        radiance, _ = ghost.composite(attached)
+        radiance, _ = ghost.composite(attached, ray.d)
         image = losses.log_l1(radiance, sample.radiance)
         total, outline = image, mi.Float(0)
         if self.outlines:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -20,14 +19,14 @@ from ..export import check_output_folder, export_fit, make_output_folder, write_
 from ..export.asset import write_asset
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
-from ..fields.moved_template import advect
+from ..fields.lattice_fields import closed_at_border
+from ..fields.thin_parts import back_on_solid, thickened_field
 from ..fields.visual_hull import visual_hull
 from ..files import replacing
 from ..lattice import make_lattice
 from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
 from ..scene import load_fit_scene
-from ..topology import topology
 from ..views import PinholeViews
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
 from .config import FitConfig, default_output
@@ -43,6 +42,7 @@ from .outlines import Outlines
 from .pixels import PixelPool
 from .progress import Progress
 from .radiance_ghost import RadianceGhost
+from .recast import recast
 from .refinement import PhotometricRefinement
 from .start import TYPICAL_REFLECTANCE, block_arrays, check_given, start_fields, start_light, start_material
 
@@ -55,8 +55,11 @@ _HOLD_OUT = 8
 #: Between two checkpoints at least this many times what writing one takes.
 _CHECKPOINT_PAUSE = 10
 
-#: Parts of the refinement's displacement that are tried until one does not tear the surface.
-_FRACTIONS = (1.0, 0.8, 0.6, 0.4, 0.2)
+#: The hull is sampled up to this many times finer than the lattice, to find what is too thin for it ...
+_HULL_REFINEMENT = 3
+
+#: ... with at most so many cells per side, as memory grows with their cube.
+_HULL_CELLS = 256
 
 STAGES = ("hull", "ghost", "refinement", "field", "joint", "done")
 
@@ -142,10 +145,7 @@ class _Fit:
             if self.checkpoint.stage == "ghost":
                 self._ghost()
             if self.checkpoint.stage == "refinement":
-                hull = self.checkpoint.arrays["sdf"]
                 self._refine()
-                moved = not np.array_equal(hull, self.checkpoint.arrays["sdf"])
-                self.checkpoint.facts["refinement_kept"] = moved
             joint = self._joint()
             self.interrupt.check()
             with self.progress.stage("export", None), self._timed("export"):
@@ -179,21 +179,26 @@ class _Fit:
             return
         with self.progress.stage("visual hull", len(self.views)) as advance, self._timed("hull"):
             to_world = mi.Transform4f(self.scene.subject.to_world)
-            points = to_world @ mi.Point3f(self.lattice.points(mi.Float))
+            finer = max(min(_HULL_REFINEMENT, _HULL_CELLS // self.lattice.resolution), 1)
+            lattice = make_lattice(self.lattice.grid, finer * self.lattice.resolution)
+            points = to_world @ mi.Point3f(lattice.points(mi.Float))
             world = visual_hull(points, self.views, [target.rgba[..., 3] for target in self.scene.targets],
                                 daylight_votes=self.config.hull_daylight_votes, progress=advance)
-            sdf = self._closed_at_border(world.numpy() / _length_scale(self.scene.subject.to_world))
+            cell = self.lattice.spacing
+            fine = np.clip(world.numpy() / _length_scale(self.scene.subject.to_world), -1, 1) / cell
+            grown, hull = thickened_field(fine.reshape((lattice.stride,) * 3), finer)
+            sdf, hull = (closed_at_border(cell * field, self.lattice) for field in (grown, hull))
         if not (sdf < 0).any():
             raise UserError(
                 f"The masks of the targets have no common volume in the box of '{self.scene.path}'; check "
                 f"the cameras, the alpha of the targets and the gshell shape's to_world.")
-        self._enter("ghost", sdf=sdf)
+        self._enter("ghost", sdf=sdf, hull=hull)
 
     def _start_from_file(self) -> None:
         """Starts from the fields that the scene's gshell shape was given, openings included."""
         fields = self.scene.subject.fields().to_lattice(self.lattice.resolution)
         if self.config.watertight or (fields.msdf > 0).all():
-            self._enter("ghost", sdf=fields.sdf)
+            self._enter("ghost", sdf=fields.sdf, hull=fields.sdf)
             return
         count = self.lattice.vertex_count
         brightness = self.pixels.mean_radiance()
@@ -201,23 +206,13 @@ class _Fit:
                     radiance=np.zeros((count, 3), np.float32), known=np.zeros(count, bool),
                     light=np.float32(brightness / TYPICAL_REFLECTANCE))
 
-    def _closed_at_border(self, sdf: np.ndarray) -> np.ndarray:
-        """Outside at the cube's faces, so that the template is watertight; finite everywhere."""
-        n, cell = self.lattice.stride, self.lattice.spacing
-        grid = np.clip(sdf, -1.0, 1.0).reshape(n, n, n).astype(np.float32)
-        for axis in range(3):
-            ends = np.moveaxis(grid, axis, 0)
-            ends[[0, -1]] = np.maximum(ends[[0, -1]], 0.5 * cell)
-        return grid.ravel()
-
     def _ghost(self) -> None:
         """Finds the openings of the template, and its radiance."""
         state = self.checkpoint.arrays
         template, vertices, faces = self._template(state["sdf"])
         ghost = RadianceGhost(vertices, faces, self.views, self.pixels, self.config)
         if not self.config.watertight:
-            self._iterate("ghost", self.config.ghost_iterations, ghost, {"ghost": ghost.optimizer},
-                          {"sdf": state["sdf"]})
+            self._iterate("ghost", self.config.ghost_iterations, ghost, {"ghost": ghost.optimizer}, state)
         with self.progress.stage("openings", None), self._timed("ghost"):
             logits = np.ones(len(vertices))
             if not self.config.watertight:
@@ -232,8 +227,8 @@ class _Fit:
         radiance, known = splat_to_lattice(mi.Float(front.ravel()), template, self.lattice)
         light = float(np.median(front[~opened].mean(axis=1)))
         radiance = radiance.numpy().reshape(-1, 3)
-        self._enter("refinement", sdf=state["sdf"], msdf=msdf.numpy(), radiance=radiance, known=known.numpy(),
-                    light=np.float32(light / TYPICAL_REFLECTANCE))
+        self._enter("refinement", sdf=state["sdf"], hull=state["hull"], msdf=msdf.numpy(), radiance=radiance,
+                    known=known.numpy(), light=np.float32(light / TYPICAL_REFLECTANCE))
 
     def _openings(self, ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """(V,) opacity logits of a fitted ghost, negative where the images justify an opening."""
@@ -245,71 +240,40 @@ class _Fit:
         """Moves the template inside the hull, and the fields with it."""
         state = self.checkpoint.arrays
         template, vertices, faces = self._template(state["sdf"])
-        solid = template.interpolate(mi.Float(state["msdf"])).numpy() > 0
+        logits, excess = (template.interpolate(mi.Float(state[name])).numpy() for name in ("msdf", "hull"))
+        solid = logits > 0
+        scale = _length_scale(self.scene.subject.to_world)
+        start = back_on_solid(vertices, faces, np.where(solid, scale * excess, 0))
         every = np.arange(len(self.views))
         held_out = every[::_HOLD_OUT]
         seen = np.setdiff1d(every, held_out) if len(every) > 1 else every
         known, unknown = (PixelPool(self.views, self.scene.targets, chosen) for chosen in (seen, held_out))
-        ghost = RadianceGhost(vertices, faces, self.views, known, self.config)
-        ghost.refit(solid)
-        before = ghost.unexplained(unknown)
+        ghost = RadianceGhost(start, faces, self.views, known, self.config, glossy=True)
+        for _ in range(3):
+            ghost.refit(solid)
+        unexplained = ghost.unexplained(unknown)
         outlines = None
         if self.pixels.has_alpha:
             alphas = [target.rgba[..., 3] for target in self.scene.targets]
             outlines = Outlines(self.views, alphas, faces, solid)
-        cell = self.lattice.spacing * _length_scale(self.scene.subject.to_world)
-        refinement = PhotometricRefinement(ghost, vertices, faces, outlines, cell, self.config)
+        cell = self.lattice.spacing * scale
+        refinement = PhotometricRefinement(ghost, start, faces, outlines, cell, self.config)
         self._iterate("refinement", self.config.refinement_iterations, refinement,
                       {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
         with self._timed("refinement"):
             ghost.move(mi.Float(refinement.positions().ravel()))
             ghost.refit(solid)
-            fields = {name: state[name] for name in _SURFACE}
-            if ghost.unexplained(unknown) < self.config.refinement_gain * before:
-                movement = refinement.positions() - vertices
-                fields = self._carried(fields, self._displacement(movement, template))
-        self._enter("joint", **fields, light=state["light"])
-
-    def _displacement(self, movement: np.ndarray, template: SurfaceMesh) -> mi.Float:
-        """The movement of the template's vertices, (V, 3) in world units, as a lattice field."""
-        to_lattice = mi.Transform4f(self.scene.subject.to_world).inverse()
-        moved = to_lattice @ mi.Vector3f(movement.T.astype(np.float32))
-        return splat_to_lattice(dr.ravel(mi.Vector3f(moved)), template, self.lattice)[0]
-
-    def _carried(self, before: dict[str, np.ndarray], displacement: mi.Float) -> dict[str, np.ndarray]:
-        """The fields carried along as much of the displacement as leaves the surface in one piece.
-
-        Where the template is thin its two sides may want to pass through one another, which no field can
-        follow: the surface tears.
-        """
-        wanted = self._topology(before)
-        for fraction in _FRACTIONS:
-            fields = {name: advect(mi.Float(values.astype(np.float32).ravel()), fraction * displacement,
-                                   self.lattice).numpy() for name, values in before.items()}
-            fields["sdf"] = self._closed_at_border(fields["sdf"])
-            fields["msdf"] = self._without_specks(fields["sdf"], fields["msdf"])
-            fields["radiance"] = fields["radiance"].reshape(-1, 3)
-            fields["known"] = fields["known"] > 0.5
-            if self._topology(fields) == wanted:
-                return fields
-        return before
-
-    def _topology(self, fields: Mapping[str, np.ndarray]) -> tuple[int, int, int]:
-        """Components, boundary loops and pinholes of a surface."""
-        closed = LatticeFields.closed(fields["sdf"], self.lattice.grid)
-        self.scene.subject.set_fields(dataclasses.replace(closed, msdf=fields["msdf"]))
-        vertices, faces, _ = self.scene.subject.surface.to_numpy()
-        counts = topology(vertices, faces)
-        return counts.components, counts.boundary_loops, counts.pinholes
-
-    def _without_specks(self, sdf: np.ndarray, msdf: np.ndarray) -> np.ndarray:
-        """The mSDF without the small cuts and islands that the movement has left."""
-        template, vertices, faces = self._template(sdf)
-        logits = template.interpolate(mi.Float(msdf)).numpy() / self.lattice.spacing
-        cleaned = clean_opacity(logits, vertices, faces, self.config.ghost_min_area)
-        if (cleaned == logits).all():
-            return msdf
-        return msdf_from_template(cleaned, template, self.lattice).numpy()
+            kept = ghost.unexplained(unknown) < self.config.refinement_gain * unexplained
+            # Without a refinement, what was grown for being thin shrinks back.
+            moved = refinement.positions() if kept else start
+            fields = None
+            if (moved != vertices).any():
+                before = LatticeFields.closed(state["sdf"], self.lattice.grid)
+                self.scene.subject.set_fields(dataclasses.replace(before, msdf=state["msdf"]))
+                fields = recast(self.scene.subject, vertices, moved, faces, logits / self.lattice.spacing,
+                                ghost.radiance()[0], self.config.ghost_min_area)
+        self.checkpoint.facts["refinement_kept"] = kept and fields is not None
+        self._enter("joint", **(fields or {name: state[name] for name in _SURFACE}), light=state["light"])
 
     def _template(self, sdf: np.ndarray) -> tuple[SurfaceMesh, np.ndarray, np.ndarray]:
         """The template that is where ``sdf`` changes sign, its vertices and its faces."""

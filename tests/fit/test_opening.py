@@ -8,7 +8,13 @@ from topology import assert_manifold, loop_count
 
 from gshell_mi.extraction import extract
 from gshell_mi.fields import sphere
-from gshell_mi.fit.opening import clean_opacity, close_unjustified, msdf_from_template, splat_to_lattice
+from gshell_mi.fit.opening import (
+    clean_opacity,
+    close_unjustified,
+    msdf_from_template,
+    splat_to_lattice,
+    without_specks,
+)
 from gshell_mi.lattice import TetLattice
 
 
@@ -116,3 +122,22 @@ def test_splatted_constants_come_back():
     assert known.numpy()[np.abs(fields.sdf) < 2 * lattice.spacing].all()
     back = template.interpolate(field, 3).numpy()
     np.testing.assert_allclose(back.T, np.tile([0.2, 0.5, 0.9], (template.vertex_count, 1)), rtol=1e-4)
+
+
+def test_specks_go_and_openings_stay():
+    lattice = TetLattice(24)
+    fields = sphere(lattice, 0.7)
+    sdf, still = mi.Float(fields.sdf), mi.Float(fields.deform)
+    points = lattice.vertex_positions()
+    opening = 0.3 - points[:, 1]
+    cut = 0.12 - np.linalg.norm(points - [0.7, -0.2, 0], axis=1)
+    island = 0.12 - np.linalg.norm(points - [0, 0.7, 0], axis=1)
+    msdf = mi.Float(np.maximum(np.minimum(opening, -cut), island).astype(np.float32))
+    template = extract(lattice, sdf, msdf, still, template=True).template
+    assert loop_count(extract(lattice, sdf, msdf, still).to_numpy()[1]) == 3
+    cleaned = without_specks(msdf, template, lattice, 0.02)
+    vertices, faces, _ = extract(lattice, sdf, cleaned, still).to_numpy()
+    assert loop_count(faces) == 1
+    assert vertices[:, 1].max() == pytest.approx(0.3, abs=1e-4)
+    far = (np.abs(cut) > 0.3) & (np.abs(island) > 0.3)
+    np.testing.assert_array_equal(cleaned.numpy()[far], msdf.numpy()[far])

@@ -59,7 +59,8 @@ BACK = np.array([[0.3, 0.3, 3.0], [0.7, 0.2, 0.6]])
 
 
 def composite(ghost, origin, direction):
-    radiance, alpha = ghost.composite(ghost._sheets(mi.Ray3f(origin, direction)))
+    ray = mi.Ray3f(origin, direction)
+    radiance, alpha = ghost.composite(ghost._sheets(ray), ray.d)
     return np.ravel(radiance), np.ravel(alpha)[0]
 
 
@@ -97,7 +98,8 @@ def test_derivatives_of_coverage(sheets):
     opacity = mi.Float(sheets.optimizer["opacity"])
     dr.enable_grad(opacity)
     old, sheets.optimizer["opacity"] = sheets.optimizer["opacity"], opacity
-    _, alpha = sheets.composite(sheets._sheets(mi.Ray3f([0.1, 0.2, 5], [0, 0, -1])))
+    ray = mi.Ray3f([0.1, 0.2, 5], [0, 0, -1])
+    _, alpha = sheets.composite(sheets._sheets(ray), ray.d)
     dr.backward(alpha)
     gradient = dr.grad(sheets.optimizer["opacity"]).numpy().reshape(2, 4).sum(1)
     sheets.optimizer["opacity"] = dr.detach(old)

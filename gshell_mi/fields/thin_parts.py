@@ -1,0 +1,55 @@
+"""Parts of a solid that are thinner than a lattice cell, made thick enough for the lattice to hold them.
+
+A sheet in a visual hull (a brim, a hem, a leaf) may be thinner than a cell. The lattice then sees it at some
+of its vertices and misses it at others: the template is frayed or falls apart.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from scipy import ndimage
+
+#: A part is thin where no ball of this radius, in cells, that fits inside comes as near as twice its radius:
+#: sheets of up to a cell, and edges sharper than 60 degrees.
+_RADIUS = 0.5
+
+#: Half the thickness, in cells, that a lattice never misses.
+_HALF = 0.55
+
+
+def thickened_field(sdf: np.ndarray, refinement: int) -> tuple[np.ndarray, np.ndarray]:
+    """Samples a signed distance field for a lattice that its thin parts would slip through.
+
+    Args:
+        sdf: (refinement n + 1,)*3 signed distances, in units of the coarse cells.
+        refinement: fine cells per coarse cell.
+
+    Returns:
+        Two (n + 1,)*3 fields at the coarse lattice's vertices, in the same units: the distances with the
+        thin parts grown, and those of the solid itself.
+    """
+    coarse = sdf[::refinement, ::refinement, ::refinement]
+    thin, core = sdf < 0, sdf < -_RADIUS
+    if core.any():
+        thin &= ndimage.distance_transform_edt(~core) > 2 * _RADIUS * refinement
+    if not thin.any():
+        return coarse, coarse
+    around = 2 * refinement + 1
+    half = ndimage.maximum_filter(np.where(thin, -sdf, 0), size=around)
+    growth = np.where(thin, np.clip(_HALF - half, 0, None), 0)
+    # The lattice vertices that will hold the part lie beside it.
+    growth = ndimage.gaussian_filter(ndimage.maximum_filter(growth, size=around), 0.5 * refinement)
+    return coarse - growth[::refinement, ::refinement, ::refinement], coarse
+
+
+def back_on_solid(vertices: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Undoes the growth: moves vertices against their normals by their (V,) distance from the solid itself.
+
+    Args:
+        vertices: (V, 3) of the grown template.
+        faces: (F, 3), oriented outwards.
+        distance: in the unit of the vertices; negative ones do not count.
+    """
+    normals = np.array(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
+    return vertices - np.maximum(distance, 0)[:, None] * normals

@@ -1,0 +1,111 @@
+"""Fields of moved templates: the surface lies where it was moved to, in one piece, with its openings."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from gshell_mi.fields import LatticeFields
+from gshell_mi.fit.recast import recast, thickened
+from gshell_mi.topology import topology
+
+RESOLUTION = 32
+CELL = 2 / RESOLUTION
+
+
+def sphere(to_world: mi.ScalarTransform4f | None = None):
+    """A gshell shape of radius 0.6 in lattice units, its template's vertices and faces."""
+    subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION,
+                            "to_world": to_world or mi.ScalarTransform4f()})
+    radius = np.linalg.norm(subject.lattice.vertex_positions(), axis=1)
+    subject.set_fields(LatticeFields.closed(radius - 0.6))
+    vertices, faces, _ = subject.template().to_numpy()
+    return subject, vertices.astype(float), faces
+
+
+def surface(subject, fields) -> trimesh.Trimesh:
+    closed = LatticeFields.closed(fields["sdf"])
+    subject.set_fields(LatticeFields(closed.sdf, fields["msdf"], closed.deform))
+    vertices, faces, _ = subject.surface.to_numpy()
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def cut(subject, msdf) -> None:
+    fields = subject.fields()
+    subject.set_fields(LatticeFields(fields.sdf, msdf, fields.deform))
+
+
+def solid(vertices) -> np.ndarray:
+    return np.full(len(vertices), 8.0)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_a_sphere_that_grew(mirror):
+    scale = [-2, 2, 2] if mirror else [2, 2, 2]
+    subject, vertices, faces = sphere(mi.ScalarTransform4f().translate([5, 0, 0]).scale(scale))
+    centre = np.array([5.0, 0, 0])
+    moved = centre + 1.2 * (vertices - centre)
+    fields = recast(subject, vertices, moved, faces, solid(vertices), np.abs(vertices - centre), 0.005)
+    found = surface(subject, fields)
+    radius = np.linalg.norm(found.vertices - centre, axis=1)
+    np.testing.assert_allclose(radius, 1.44, atol=0.08 * 2 * CELL)
+    assert found.is_watertight and found.volume > 0
+    known = fields["known"]
+    # Each takes its radiance along from where it was.
+    expected = np.abs(subject.lattice.vertex_positions()[known] * scale / 1.2)
+    near = np.abs(fields["sdf"][known]) < 0.5 * CELL
+    np.testing.assert_allclose(fields["radiance"][known][near], expected[near], atol=2 * CELL)
+
+
+def test_the_opening_moves_along():
+    subject, vertices, faces = sphere()
+    logits = (0.2 - vertices[:, 1]) / CELL
+    cut(subject, 0.2 - subject.lattice.vertex_positions()[:, 1])
+    fields = recast(subject, vertices, vertices * [1, 1.25, 1], faces, logits, np.ones((len(vertices), 3)),
+                    0.005)
+    found = surface(subject, fields)
+    counts = topology(found.vertices, found.faces)
+    assert (counts.boundary_loops, counts.pinholes, counts.components) == (1, 0, 1)
+    assert found.vertices[:, 1].max() == pytest.approx(0.25, abs=0.2 * CELL)
+    assert found.vertices[:, 1].min() == pytest.approx(-0.75, abs=0.1 * CELL)
+
+
+def test_a_sheet_stays_whole_and_in_its_place():
+    """Of a plate as thin as a third of a cell a disc of the upper side is surface."""
+    plate = trimesh.creation.box(extents=[1.3, 1.3, CELL / 3])
+    for _ in range(6):
+        plate = plate.subdivide()
+    vertices, faces = np.array(plate.vertices), np.array(plate.faces)
+    top = 0.1
+    vertices[:, 2] += top - CELL / 6
+    logits = np.where(vertices[:, 2] > top - 0.1 * CELL, 0.5 - np.hypot(*vertices[:, :2].T), -1) / CELL
+    subject, *_ = sphere()
+    cut(subject, subject.lattice.vertex_positions()[:, 1])    # one loop is wanted
+    fields = recast(subject, vertices, vertices, faces, logits, np.ones((len(vertices), 3)), 0.005)
+    found = surface(subject, fields)
+    counts = topology(found.vertices, found.faces)
+    assert (counts.boundary_loops, counts.pinholes, counts.components) == (1, 0, 1)
+    error = np.abs(found.vertices[:, 2] - top) / CELL
+    within = np.hypot(found.vertices[:, 0], found.vertices[:, 1]) < 0.4
+    assert error[within].max() < 1e-3 and error.max() < 0.2
+    assert counts.boundary_length == pytest.approx(np.pi, rel=0.05)
+
+
+def test_a_collapse_goes_only_as_far_as_the_surface_lasts():
+    subject, vertices, faces = sphere()
+    fields = recast(subject, vertices, np.zeros_like(vertices), faces, solid(vertices),
+                    np.ones((len(vertices), 3)), 0.005)
+    radius = np.linalg.norm(surface(subject, fields).vertices, axis=1)
+    np.testing.assert_allclose(radius, 0.3 * 0.6, atol=0.1 * CELL)
+
+
+def test_only_the_open_side_gives_way():
+    plate = trimesh.creation.box(extents=[1, 1, 0.5 * CELL])
+    for _ in range(5):
+        plate = plate.subdivide()
+    vertices, faces = np.array(plate.vertices), np.array(plate.faces)
+    upper = vertices[:, 2] > -0.2 * CELL
+    moved = thickened(vertices, faces, upper, CELL)
+    middle = (np.abs(vertices[:, :2]) < 0.4).all(axis=1)
+    np.testing.assert_array_equal(moved[middle & upper], vertices[middle & upper])
+    np.testing.assert_allclose(moved[middle & ~upper, 2], (0.25 - 1.2) * CELL, atol=0.1 * CELL)
