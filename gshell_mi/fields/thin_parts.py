@@ -17,6 +17,21 @@ _RADIUS = 0.5
 #: Half the thickness, in cells, that a lattice never misses.
 _HALF = 0.55
 
+#: The solid is sampled up to this many times finer than the lattice ...
+_REFINEMENT = 3
+
+#: ... with at most so many cells per side, as memory grows with their cube.
+_MOST_CELLS = 256
+
+
+def thin_part_refinement(resolution: int) -> int:
+    """Cells per cell of a lattice of ``resolution`` at which to look for parts too thin for it.
+
+    >>> [thin_part_refinement(resolution) for resolution in (64, 128, 256, 512)]
+    [3, 2, 1, 1]
+    """
+    return max(min(_REFINEMENT, _MOST_CELLS // resolution), 1)
+
 
 def thickened_field(sdf: np.ndarray, refinement: int) -> tuple[np.ndarray, np.ndarray]:
     """Samples a signed distance field for a lattice that its thin parts would slip through.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import memory
+from ..fields.thin_parts import thin_part_refinement
 from .config import FitConfig
 
 # Bytes, measured on llvm_ad_rgb: peak resident memory of short fits (all stages, a few steps each) with 32 to
@@ -15,7 +16,8 @@ _PROGRAM = 280 * 2**20  # Python, Mitsuba, LLVM and its kernels
 _ASSET = 350 * 2**20  # baking the textures of mesh.glb
 _PER_PIXEL = 68  # of all targets: NumPy's copy, the pools of the ghost and of the refinement, outlines
 _PER_VERTEX = 490  # of the lattice: fields and material, their Adam moments and gradients
-_PER_VOTE = 4  # and lattice vertex: what the visual hull keeps per view that has to see daylight
+_PER_HULL_SAMPLE = 60  # of the visual hull, which is finer than the lattice, and ...
+_PER_VOTE = 4  # ... what it keeps there per view that has to see daylight
 _PER_SQUARE_CELL = 37_000  # resolution squared, as the surface grows: meshes, edge lists, derivatives
 _PER_SAMPLE = 50  # of a rendered image
 
@@ -26,12 +28,14 @@ class MemoryEstimate:
 
     Attributes:
         program: what every fit takes, whatever its size.
+        hull: the visual hull, gone before the samples come.
         lattice: fields and the surface in them.
         targets: the images.
         samples: one rendered view.
     """
 
     program: int
+    hull: int
     lattice: int
     targets: int
     samples: int
@@ -48,7 +52,7 @@ class MemoryEstimate:
             report: whether mesh.glb and report.html are written.
 
         >>> few, many = (MemoryEstimate.of(FitConfig(), 64, np.full((n, 2), 256)) for n in (24, 48))
-        >>> many.total - few.total == many.targets - few.targets > 0
+        >>> many.targets == 2 * few.targets and many.hull > few.hull and many.lattice == few.lattice
         True
         """
         # Fields in blocks follow the surface.
@@ -57,21 +61,23 @@ class MemoryEstimate:
             whole = min(resolution, config.start_resolution)
         pixels = np.asarray(sizes, np.int64).prod(axis=1)
         votes = config.hull_daylight_votes * len(pixels)
+        hull_samples = (thin_part_refinement(whole) * whole + 1) ** 3
         return cls(
             program=_PROGRAM + (_ASSET if report else 0),
-            lattice=int((_PER_VERTEX + _PER_VOTE * votes) * (whole + 1) ** 3
-                        + _PER_SQUARE_CELL * resolution**2),
+            hull=int((_PER_HULL_SAMPLE + _PER_VOTE * votes) * hull_samples),
+            lattice=_PER_VERTEX * (whole + 1) ** 3 + _PER_SQUARE_CELL * resolution**2,
             targets=_PER_PIXEL * int(pixels.sum()),
             samples=_PER_SAMPLE * int(pixels.max()) * max(config.primal_spp, config.spp))
 
     @property
     def total(self) -> int:
-        return self.program + self.lattice + self.targets + self.samples
+        return self.program + self.targets + max(self.hull, self.lattice + self.samples)
 
     def require(self, free: int | None) -> None:
         """Refuses, by a ``UserError`` that says what to lower, a fit that needs more than ``free`` bytes."""
         cures = {
             "program": "close other programs",
+            "hull": "lower --resolution or use fewer views",
             "lattice": "lower --resolution",
             "targets": "use fewer or smaller views (--max-size of the import)",
             "samples": "lower --primal-spp and --spp, or use smaller views (--max-size of the import)",

@@ -20,7 +20,7 @@ from ..export.asset import write_asset
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..fields.lattice_fields import closed_at_border
-from ..fields.thin_parts import back_on_solid, thickened_field
+from ..fields.thin_parts import back_on_solid, thickened_field, thin_part_refinement
 from ..fields.visual_hull import visual_hull
 from ..files import replacing
 from ..lattice import make_lattice
@@ -54,12 +54,6 @@ _HOLD_OUT = 8
 
 #: Between two checkpoints at least this many times what writing one takes.
 _CHECKPOINT_PAUSE = 10
-
-#: The hull is sampled up to this many times finer than the lattice, to find what is too thin for it ...
-_HULL_REFINEMENT = 3
-
-#: ... with at most so many cells per side, as memory grows with their cube.
-_HULL_CELLS = 256
 
 STAGES = ("hull", "ghost", "refinement", "field", "joint", "done")
 
@@ -179,7 +173,7 @@ class _Fit:
             return
         with self.progress.stage("visual hull", len(self.views)) as advance, self._timed("hull"):
             to_world = mi.Transform4f(self.scene.subject.to_world)
-            finer = max(min(_HULL_REFINEMENT, _HULL_CELLS // self.lattice.resolution), 1)
+            finer = thin_part_refinement(self.lattice.resolution)
             lattice = make_lattice(self.lattice.grid, finer * self.lattice.resolution)
             points = to_world @ mi.Point3f(lattice.points(mi.Float))
             world = visual_hull(points, self.views, [target.rgba[..., 3] for target in self.scene.targets],

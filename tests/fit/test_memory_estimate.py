@@ -30,6 +30,7 @@ def test_targets_grow_with_pixels_and_the_lattice_with_cells():
 @pytest.mark.parametrize(("config", "resolution", "sizes", "cure"), [
     (FitConfig(), 512, SIZES, "lower --resolution"),
     (FitConfig(), 64, np.full((400, 2), 1000), "use fewer or smaller views"),
+    (FitConfig(), 64, np.full((400, 2), 64), "lower --resolution or use fewer views"),
     (FitConfig(primal_spp=512), 64, SIZES, "lower --primal-spp and --spp"),
     (FitConfig(), 16, SIZES[:2], "close other programs"),
 ])
