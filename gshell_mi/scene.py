@@ -78,7 +78,7 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
         before_targets(subject, sensors)
     folder = Path(targets) if targets else path.with_suffix("")
     if targets is None:
-        _render_missing_targets(path, folder, sensors, on_reference)
+        render_missing_targets(folder / "reference.xml", folder, sensors, on_reference)
     loaded = [load_target(folder / f"{sensor.id()}.exr", *sensor.film().crop_size()) for sensor in sensors]
     if not any(target.rgba[..., 3].any() for target in loaded):
         raise UserError(f"The targets in '{folder}' show no object: their alpha is 0 everywhere; "
@@ -123,10 +123,19 @@ def _the_light(scene: mi.Scene, path: Path) -> mi.Emitter:
     return found[0]
 
 
-def _render_missing_targets(path: Path, folder: Path, sensors: list[mi.Sensor],
-                            progress: Callable[[int, int], None] | None) -> None:
-    """Renders the views that have no target yet, if the scene comes with a reference."""
-    reference = folder / "reference.xml"
+def render_missing_targets(reference: Path, folder: Path, sensors: list[mi.Sensor],
+                           progress: Callable[[int, int], None] | None = None) -> None:
+    """Renders the views that have no target in ``folder`` yet, if the scene ``reference`` exists.
+
+    Args:
+        reference: the stock scene that holds the true object and light.
+        folder: gets ``<sensor id>.exr``.
+        sensors: the views.
+        progress: called with (views done, views).
+
+    Raises:
+        UserError: the reference cannot be loaded, or a target not be written.
+    """
     missing = [sensor for sensor in sensors if not (folder / f"{sensor.id()}.exr").exists()]
     if not missing or not reference.is_file():
         return

@@ -1,0 +1,1 @@
+"""Studies over many fits: runs that can be interrupted, scores, tables."""

@@ -1,0 +1,53 @@
+"""Settings of a fit as text."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+from gshell_mi.errors import UserError
+from gshell_mi.fit import FitConfig
+
+
+def parsed_settings(pairs: list[str]) -> FitConfig:
+    """The configuration that ``["resolution=48", "image_loss=l1"]`` stands for; the rest are defaults.
+
+    Raises:
+        UserError: no such setting, or a value of another kind than its default.
+    """
+    defaults, given = dataclasses.asdict(FitConfig()), {}
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        if name not in defaults:
+            raise UserError(f"There is no setting '{name}'; python -m gshell_mi.fit --help lists them.")
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = text
+        kind = int if defaults[name] is None else type(defaults[name])
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind:
+            raise UserError(f"The setting '{name}' is a {kind.__name__}, and '{text}' is none.")
+        given[name] = value
+    return FitConfig(**given)
+
+
+def as_flags(changes: dict) -> str:
+    """Settings as the options of ``python -m gshell_mi.fit``.
+
+    >>> as_flags({"ghost_gain": 0.0, "watertight": True})
+    '--ghost-gain 0 --watertight'
+    """
+    words = []
+    for name, value in changes.items():
+        flag = f"--{name.replace('_', '-')}"
+        words.append(flag if value is True else f"{flag} {value:g}" if isinstance(value, float)
+                     else f"{flag} {value}")
+    return " ".join(words)
+
+
+def non_default(config: FitConfig) -> dict:
+    """The settings that are not defaults."""
+    defaults = dataclasses.asdict(FitConfig())
+    return {name: value for name, value in dataclasses.asdict(config).items() if value != defaults[name]}

@@ -1,0 +1,155 @@
+"""Fits with their scores, kept on disk: what exists is not done again, what was interrupted goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from gshell_mi.compare import compare_fit
+from gshell_mi.errors import UserError
+from gshell_mi.export.fitted_scene import load_scene
+from gshell_mi.fit import FitConfig, fit_scene
+from gshell_mi.fit.checkpoint import Checkpoint
+from gshell_mi.scene import render_missing_targets
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A fit to make and to score; the scene's folder holds ``truth.ply``, ``test.xml``, ``reference.xml``."""
+
+    scene: Path
+    name: str
+    config: FitConfig
+
+    def record(self, output: Path) -> Path:
+        """The file that holds its outcome."""
+        return output / self.scene.stem / f"{self.name}.json"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a trial."""
+
+    config: dict
+    scores: dict
+    """``mean`` of the image scores over the test views and ``mesh`` scores, as ``compare`` gives them."""
+    cpu_seconds: float | None
+    """Of the fit, over all threads; None if it was interrupted, as only the last part is known then."""
+    wall_seconds: float
+    """Of the stages' timings, added up over interruptions."""
+    error: str | None = None
+    """Why there is no surface to score."""
+
+
+def load_outcome(trial: Trial, output: Path) -> Outcome | None:
+    """The outcome on disk; None if there is none, if it failed or if it was made with other settings."""
+    try:
+        found = Outcome(**json.loads(trial.record(output).read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
+    return found if found.config == _plain(trial.config) and not found.error else None
+
+
+def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
+    """Fits and scores, or loads what exists. The fit's folder lies beside the record.
+
+    Raises:
+        UserError: the scene lacks what scoring needs. A fit that fails is an outcome.
+    """
+    if found := load_outcome(trial, output):
+        return found
+    inside = trial.scene.with_suffix("")
+    for needed in (inside / "truth.ply", inside / "test.xml", inside / "reference.xml"):
+        if not needed.is_file():
+            raise UserError(f"'{needed}' is missing; a scene of a study needs it to be scored.")
+    folder = output / trial.scene.stem / trial.name
+    resume = _same_settings(folder / "checkpoint.npz", trial.config)
+    _render_views(inside / "reference.xml", trial.scene, inside)
+    before = time.process_time()
+    try:
+        fitted = fit_scene(trial.scene, folder, config=trial.config, resume=resume, overwrite=not resume,
+                           report=False, quiet=quiet)
+        seconds = time.process_time() - before
+        targets = output / trial.scene.stem / "test_views"
+        _render_views(inside / "reference.xml", inside / "test.xml", targets)
+        scores = compare_fit(folder, targets=targets, sensors=inside / "test.xml", mesh=inside / "truth.ply")
+        outcome = Outcome(_plain(trial.config), {"mean": scores["mean"], "mesh": scores["mesh"]},
+                          None if resume else round(seconds, 1), fitted.metrics["seconds"]["total"])
+    except UserError as error:
+        outcome = Outcome(_plain(trial.config), {}, None, 0.0, str(error))
+    record = trial.record(output)
+    record.parent.mkdir(parents=True, exist_ok=True)
+    partial = record.with_suffix(".partial")
+    partial.write_text(json.dumps(dataclasses.asdict(outcome), indent=1) + "\n")
+    os.replace(partial, record)
+    return outcome
+
+
+def run_trials(trials: list[Trial], output: Path, *, quiet: bool = True) -> Iterator[tuple[Trial, Outcome]]:
+    """Runs one trial after another, telling on the terminal how each went and how long the rest may take.
+
+    The time left is the median of the fits of this run times the number that is left.
+    """
+    todo = sum(load_outcome(trial, output) is None for trial in trials)
+    print(f"{len(trials)} fits, {len(trials) - todo} of them exist already.", flush=True)
+    durations = []
+    for number, trial in enumerate(trials, 1):
+        new = load_outcome(trial, output) is None
+        begin = time.monotonic()
+        outcome = run_trial(trial, output, quiet=quiet)
+        left = ""
+        if new:
+            durations.append(time.monotonic() - begin)
+            todo -= 1
+            left = f"  [{clock(durations[-1])}; about {clock(todo * statistics.median(durations))} left]"
+        title = f"{number}/{len(trials)} {trial.scene.stem}, {trial.name}"
+        print(f"{title}: {summary(outcome)}{left}", flush=True)
+        yield trial, outcome
+
+
+def summary(outcome: Outcome) -> str:
+    """The outcome in one line."""
+    if outcome.error:
+        return f"failed: {outcome.error}"
+    mesh, loops = outcome.scores["mesh"], outcome.scores["mesh"]["boundary_loops"]
+    return (f"loops {loops['found']} of {loops['reference']}, chamfer {mesh['chamfer']:.3f} %, "
+            f"{outcome.scores['mean']['psnr']:.2f} dB")
+
+
+def clock(seconds: float) -> str:
+    """Hours, minutes and seconds, as much as matters.
+
+    >>> clock(42.4), clock(150), clock(5400)
+    ('42 s', '2 min 30 s', '1 h 30 min')
+    """
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes >= 60:
+        return f"{minutes // 60} h {minutes % 60} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def _render_views(reference: Path, sensors: Path, folder: Path) -> None:
+    """The views of the scene file ``sensors`` that are not in ``folder`` yet; no part of any fit's time."""
+    folder.mkdir(parents=True, exist_ok=True)
+    render_missing_targets(reference, folder, load_scene(sensors).sensors())
+
+
+def _same_settings(checkpoint: Path, config: FitConfig) -> bool:
+    """Whether there is an interrupted fit with these settings."""
+    if not checkpoint.is_file():
+        return False
+    try:
+        return Checkpoint.load(checkpoint).config == _plain(config)
+    except UserError:
+        return False
+
+
+def _plain(config: FitConfig) -> dict:
+    # As JSON gives it back: tuples are lists there.
+    return json.loads(json.dumps(dataclasses.asdict(config)))

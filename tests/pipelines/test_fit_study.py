@@ -1,0 +1,162 @@
+"""The studies over many fits: rows of the ablation, settings as text, runs that go on, tables."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from bowl import CLOSED, SHORT, sensors_xml, write_scene
+
+from gshell_mi.errors import UserError
+from gshell_mi.fit import FitConfig
+
+PIPELINES = Path(__file__).parents[2] / "pipelines"
+sys.path.insert(0, str(PIPELINES))
+
+import ablation  # noqa: E402
+import score_scenes  # noqa: E402
+from fit_study import trials  # noqa: E402
+from fit_study.ablation_rows import ROWS  # noqa: E402
+from fit_study.settings import as_flags, non_default, parsed_settings  # noqa: E402
+from fit_study.tables import table  # noqa: E402
+from fit_study.trials import Outcome, Trial, load_outcome, run_trial, run_trials  # noqa: E402
+
+#: The options of a fit that is over at once, whose openings do not matter, as NAME=VALUE.
+_OPTIONS = [*SHORT[:-1], *CLOSED, "--iterations", "2"]
+QUICK = [f"{flag[2:].replace('-', '_')}={value}"
+         for flag, value in dict(zip(_OPTIONS[::2], _OPTIONS[1::2], strict=True)).items()]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = write_scene(tmp_path_factory.mktemp("study"))
+    test = "\n".join(sensors_xml(views=2)).replace("view_", "test_")
+    (path.with_suffix("") / "test.xml").write_text(f'<scene version="3.0.0">\n{test}\n</scene>\n')
+    return path
+
+
+def outcome(config=None, **changes):
+    counts = {name: {"found": 3, "reference": 2} for name in ("boundary_loops", "pinholes", "components")}
+    mesh = {**counts, "nonmanifold_edges": {"found": 0, "reference": 0}, "chamfer": 0.1234, "f_score": 0.9876,
+            "boundary_length": {"found": 1.0, "reference": 2.0}}
+    scores = {"mesh": mesh, "mean": {"psnr": 31.239, "mask_iou": 0.98765}}
+    return Outcome(config or {}, scores, 123.4, 70.0, **changes)
+
+
+def test_every_row_changes_what_it_says_and_is_accepted():
+    assert len({row.name for row in ROWS}) == len(ROWS)
+    default = FitConfig()
+    assert ROWS[0].config(default) == default
+    for row in ROWS[1:]:
+        changed = non_default(row.config(default))
+        assert changed == row.changes, row.name
+
+
+def test_the_rows_switch_every_loss():
+    from gshell_mi.fit.config import WEIGHTS
+
+    default = FitConfig()
+    switched = {name for row in ROWS for name, value in row.changes.items()
+                if name in WEIGHTS and (value == 0) == (getattr(default, name) > 0)}
+    assert switched == set(WEIGHTS) - {"flexicubes_deviation"}, "each is left out, or put in if it is out"
+
+
+def test_settings_as_text():
+    config = parsed_settings(["resolution=48", "ghost_gain=1", "image_loss=l1", "watertight=true"])
+    assert config == FitConfig(resolution=48, ghost_gain=1.0, image_loss="l1", watertight=True)
+    assert as_flags(non_default(config)) == "--resolution 48 --watertight --ghost-gain 1 --image-loss l1"
+
+
+@pytest.mark.parametrize(("pair", "complaint"), [
+    ("resolution=fine", "'resolution' is a int, and 'fine' is none"),
+    ("watertight=1", "'watertight' is a bool"),
+    ("iterations", "'iterations' is a int"),
+    ("sharpness=3", "no setting 'sharpness'"),
+    ("iterations=-1", "--iterations must not be negative"),
+])
+def test_settings_that_are_none(pair, complaint):
+    with pytest.raises(UserError, match=complaint):
+        parsed_settings([pair])
+
+
+def test_table():
+    rows = [("A", "first", outcome()), ("A", "second", None), ("B", "third", outcome(error="nothing in 'x'"))]
+    lines = table(rows, "what").splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert len({len(row) for row in cells}) == 1, "as many cells in every line"
+    first = dict(zip(cells[0], cells[3], strict=True))
+    assert first == {"what": "first", "loops": "3 / 2", "pin-holes": "3", "components": "3 / 2",
+                     "non-manifold": "0", "rim": "0.50", "chamfer %": "0.123", "F-score": "0.988",
+                     "novel dB": "31.24", "mask IoU": "0.9877", "CPU s": "123"}
+    assert [row[0] for row in cells[2:]] == ["**A**", "first", "**B**", "third"]
+    assert cells[-1][1] == "failed: nothing"
+
+
+def test_only_the_same_settings_count(tmp_path):
+    trial = Trial(Path("shirt.xml"), "default", FitConfig())
+    assert load_outcome(trial, tmp_path) is None
+    plain = json.loads(json.dumps(dataclasses.asdict(trial.config)))
+    trial.record(tmp_path).parent.mkdir()
+    trial.record(tmp_path).write_text(json.dumps(dataclasses.asdict(outcome(plain))))
+    assert load_outcome(trial, tmp_path).scores["mean"]["psnr"] == 31.239
+    assert load_outcome(Trial(trial.scene, "default", FitConfig(seed=1)), tmp_path) is None
+    trial.record(tmp_path).write_text(json.dumps(dataclasses.asdict(outcome(plain, error="no"))))
+    assert load_outcome(trial, tmp_path) is None, "what failed is tried again"
+    trial.record(tmp_path).write_text("{")
+    assert load_outcome(trial, tmp_path) is None
+
+
+def test_fits_scores_and_does_neither_twice(scene, tmp_path, capsys, monkeypatch):
+    options = [str(scene), "--rows", "default", "no-mask", "--set", *QUICK,
+               "-o", str(tmp_path / "fits"), "--page", str(tmp_path / "page.md")]
+    assert ablation.main(options) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == "2 fits, 0 of them exist already."
+    assert told[1].startswith("1/2 bowl, default: loops ") and "left]" in told[1]
+    assert told[2].startswith("2/2 bowl, no-mask: ") and "about 0 s left" in told[2]
+    page = (tmp_path / "page.md").read_text()
+    assert "## bowl" in page and "| mask `--joint-mask 0` |" in page
+    assert "`--resolution" not in page and "--iterations 2" in page, "shared settings are named"
+    assert "Not measured: another seed;" in page
+
+    monkeypatch.setattr(trials, "fit_scene", None)
+    assert ablation.main(options) == 0
+    assert capsys.readouterr().out.splitlines()[0] == "2 fits, 2 of them exist already."
+    assert (tmp_path / "page.md").read_text() == page
+
+
+def test_an_interrupted_fit_goes_on(scene, tmp_path, monkeypatch):
+    trial = Trial(scene, "default", parsed_settings(QUICK))
+
+    def interrupted(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trials, "compare_fit", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_trial(trial, tmp_path)
+    assert load_outcome(trial, tmp_path) is None
+    before = (tmp_path / "bowl" / "default" / "log.jsonl").read_text()
+    monkeypatch.undo()
+    found = run_trial(trial, tmp_path)
+    assert found.error is None and found.cpu_seconds is None and found.wall_seconds > 0
+    assert (tmp_path / "bowl" / "default" / "log.jsonl").read_text() == before, "no step was done again"
+
+
+def test_a_fit_that_fails_is_told(scene, tmp_path, monkeypatch, capsys):
+    def failing(*args, **options):
+        raise UserError("The ghost found nothing opaque.")
+
+    monkeypatch.setattr(trials, "fit_scene", failing)
+    ((_, found),) = run_trials([Trial(scene, "default", FitConfig())], tmp_path)
+    assert found.error == "The ghost found nothing opaque."
+    assert "default: failed: The ghost found nothing opaque." in capsys.readouterr().out
+
+
+def test_scene_without_truth(tmp_path, capsys):
+    path = write_scene(tmp_path)
+    options = ["--page", str(tmp_path / "page.md"), "-o", str(tmp_path / "fits")]
+    assert score_scenes.main([str(path), *options]) == 2
+    assert "test.xml' is missing; a scene of a study needs it to be scored" in capsys.readouterr().err
+    assert score_scenes.main([str(path), *options, "--page-only"]) == 0
+    assert "Not measured: bowl." in (tmp_path / "page.md").read_text()
