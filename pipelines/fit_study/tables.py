@@ -28,8 +28,11 @@ of the fit on all threads together: unlike wall time, they depend little on what
 def table(rows: list[tuple[str | None, str, Outcome | None]], first: str) -> str:
     """A table of (group, label, outcome): a group is a heading of its own line where it changes.
 
-    ``first`` is the heading of the labels. Outcomes that are None are left out.
+    ``first`` is the heading of the labels. Outcomes that are None are left out; those that were made by
+    another version of the code than the first are marked.
     """
+    code = next((outcome.code for _, _, outcome in rows if outcome), None)
+    marked = False
     names = list(_COLUMNS)
     lines = [f"| {first} | {' | '.join(names)} | CPU s |", "|---" * (len(names) + 2) + "|"]
     shown = None
@@ -39,7 +42,11 @@ def table(rows: list[tuple[str | None, str, Outcome | None]], first: str) -> str
         if group and group != shown:
             lines.append(f"| **{group}** |" + " |" * (len(names) + 1))
             shown = group
+        if outcome.code != code:
+            label, marked = f"{label} †", True
         lines.append(f"| {label} | {' | '.join(_cells(outcome))} |")
+    if marked:
+        lines += ["", "† Fitted with another version of the code than the first row."]
     return "\n".join(lines) + "\n"
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import statistics
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
+import gshell_mi
 from gshell_mi.compare import compare_fit
 from gshell_mi.errors import UserError
 from gshell_mi.export.fitted_scene import load_scene
@@ -43,17 +46,25 @@ class Outcome:
     """Of the fit, over all threads; None if it was interrupted, as only the last part is known then."""
     wall_seconds: float
     """Of the stages' timings, added up over interruptions."""
+    code: str
+    """``code_version`` of the package that made the fit."""
     error: str | None = None
     """Why there is no surface to score."""
 
 
 def load_outcome(trial: Trial, output: Path) -> Outcome | None:
-    """The outcome on disk; None if there is none, if it failed or if it was made with other settings."""
+    """The outcome on disk; None if there is none or if it was made with other settings."""
     try:
         found = Outcome(**json.loads(trial.record(output).read_text()))
     except (OSError, ValueError, TypeError):
         return None
-    return found if found.config == _plain(trial.config) and not found.error else None
+    return found if found.config == _plain(trial.config) else None
+
+
+def is_done(trial: Trial, output: Path) -> bool:
+    """Whether there is an outcome to keep; what failed is tried again, as its cause may be mended."""
+    found = load_outcome(trial, output)
+    return found is not None and not found.error
 
 
 def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
@@ -62,8 +73,8 @@ def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
     Raises:
         UserError: the scene lacks what scoring needs. A fit that fails is an outcome.
     """
-    if found := load_outcome(trial, output):
-        return found
+    if is_done(trial, output):
+        return load_outcome(trial, output)
     inside = trial.scene.with_suffix("")
     for needed in (inside / "truth.ply", inside / "test.xml", inside / "reference.xml"):
         if not needed.is_file():
@@ -71,7 +82,7 @@ def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
     folder = output / trial.scene.stem / trial.name
     resume = _same_settings(folder / "checkpoint.npz", trial.config)
     _render_views(inside / "reference.xml", trial.scene, inside)
-    before = time.process_time()
+    code, before = code_version(), time.process_time()
     try:
         fitted = fit_scene(trial.scene, folder, config=trial.config, resume=resume, overwrite=not resume,
                            report=False, quiet=quiet)
@@ -80,9 +91,10 @@ def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
         _render_views(inside / "reference.xml", inside / "test.xml", targets)
         scores = compare_fit(folder, targets=targets, sensors=inside / "test.xml", mesh=inside / "truth.ply")
         outcome = Outcome(_plain(trial.config), {"mean": scores["mean"], "mesh": scores["mesh"]},
-                          None if resume else round(seconds, 1), fitted.metrics["seconds"]["total"])
+                          None if resume else round(seconds, 1), fitted.metrics["seconds"]["total"],
+                          code)
     except UserError as error:
-        outcome = Outcome(_plain(trial.config), {}, None, 0.0, str(error))
+        outcome = Outcome(_plain(trial.config), {}, None, 0.0, code, str(error))
     record = trial.record(output)
     record.parent.mkdir(parents=True, exist_ok=True)
     partial = record.with_suffix(".partial")
@@ -96,11 +108,11 @@ def run_trials(trials: list[Trial], output: Path, *, quiet: bool = True) -> Iter
 
     The time left is the median of the fits of this run times the number that is left.
     """
-    todo = sum(load_outcome(trial, output) is None for trial in trials)
+    todo = sum(not is_done(trial, output) for trial in trials)
     print(f"{len(trials)} fits, {len(trials) - todo} of them exist already.", flush=True)
     durations = []
     for number, trial in enumerate(trials, 1):
-        new = load_outcome(trial, output) is None
+        new = not is_done(trial, output)
         begin = time.monotonic()
         outcome = run_trial(trial, output, quiet=quiet)
         left = ""
@@ -111,6 +123,15 @@ def run_trials(trials: list[Trial], output: Path, *, quiet: bool = True) -> Iter
         title = f"{number}/{len(trials)} {trial.scene.stem}, {trial.name}"
         print(f"{title}: {summary(outcome)}{left}", flush=True)
         yield trial, outcome
+
+
+@cache
+def code_version() -> str:
+    """A digest of the package's source: fits of different versions should not be compared."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(gshell_mi.__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def summary(outcome: Outcome) -> str:

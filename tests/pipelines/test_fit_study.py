@@ -20,7 +20,7 @@ from fit_study import trials  # noqa: E402
 from fit_study.ablation_rows import ROWS  # noqa: E402
 from fit_study.settings import as_flags, non_default, parsed_settings  # noqa: E402
 from fit_study.tables import table  # noqa: E402
-from fit_study.trials import Outcome, Trial, load_outcome, run_trial, run_trials  # noqa: E402
+from fit_study.trials import Outcome, Trial, is_done, load_outcome, run_trial, run_trials  # noqa: E402
 
 #: The options of a fit that is over at once, whose openings do not matter, as NAME=VALUE.
 _OPTIONS = [*SHORT[:-1], *CLOSED, "--iterations", "2"]
@@ -41,7 +41,7 @@ def outcome(config=None, **changes):
     mesh = {**counts, "nonmanifold_edges": {"found": 0, "reference": 0}, "chamfer": 0.1234, "f_score": 0.9876,
             "boundary_length": {"found": 1.0, "reference": 2.0}}
     scores = {"mesh": mesh, "mean": {"psnr": 31.239, "mask_iou": 0.98765}}
-    return Outcome(config or {}, scores, 123.4, 70.0, **changes)
+    return Outcome(config or {}, scores, 123.4, 70.0, **{"code": "a"} | changes)
 
 
 def test_every_row_changes_what_it_says_and_is_accepted():
@@ -59,7 +59,8 @@ def test_the_rows_switch_every_loss():
     default = FitConfig()
     switched = {name for row in ROWS for name, value in row.changes.items()
                 if name in WEIGHTS and (value == 0) == (getattr(default, name) > 0)}
-    assert switched == set(WEIGHTS) - {"flexicubes_deviation"}, "each is left out, or put in if it is out"
+    # Those two need another grid, and depth maps.
+    assert switched == set(WEIGHTS) - {"flexicubes_deviation", "joint_depth"}
 
 
 def test_settings_as_text():
@@ -91,6 +92,8 @@ def test_table():
                      "novel dB": "31.24", "mask IoU": "0.9877", "CPU s": "123"}
     assert [row[0] for row in cells[2:]] == ["**A**", "first", "**B**", "third"]
     assert cells[-1][1] == "failed: nothing"
+    mixed = table([("A", "first", outcome()), ("A", "second", outcome(code="b"))], "what").splitlines()
+    assert mixed[4].startswith("| second † |") and mixed[-1].startswith("† Fitted with another version")
 
 
 def test_only_the_same_settings_count(tmp_path):
@@ -99,10 +102,10 @@ def test_only_the_same_settings_count(tmp_path):
     plain = json.loads(json.dumps(dataclasses.asdict(trial.config)))
     trial.record(tmp_path).parent.mkdir()
     trial.record(tmp_path).write_text(json.dumps(dataclasses.asdict(outcome(plain))))
-    assert load_outcome(trial, tmp_path).scores["mean"]["psnr"] == 31.239
+    assert load_outcome(trial, tmp_path).scores["mean"]["psnr"] == 31.239 and is_done(trial, tmp_path)
     assert load_outcome(Trial(trial.scene, "default", FitConfig(seed=1)), tmp_path) is None
     trial.record(tmp_path).write_text(json.dumps(dataclasses.asdict(outcome(plain, error="no"))))
-    assert load_outcome(trial, tmp_path) is None, "what failed is tried again"
+    assert load_outcome(trial, tmp_path).error == "no" and not is_done(trial, tmp_path), "it is tried again"
     trial.record(tmp_path).write_text("{")
     assert load_outcome(trial, tmp_path) is None
 
