@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 import statistics
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import timedelta
 from functools import cache
 from pathlib import Path
 
@@ -17,6 +17,7 @@ import gshell_mi
 from gshell_mi.compare import compare_fit
 from gshell_mi.errors import UserError
 from gshell_mi.export.fitted_scene import load_scene
+from gshell_mi.files import replacing
 from gshell_mi.fit import FitConfig, fit_scene
 from gshell_mi.fit.checkpoint import Checkpoint
 from gshell_mi.scene import render_missing_targets
@@ -97,9 +98,8 @@ def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
         outcome = Outcome(_plain(trial.config), {}, None, 0.0, code, str(error))
     record = trial.record(output)
     record.parent.mkdir(parents=True, exist_ok=True)
-    partial = record.with_suffix(".partial")
-    partial.write_text(json.dumps(dataclasses.asdict(outcome), indent=1) + "\n")
-    os.replace(partial, record)
+    with replacing(record) as partial:
+        partial.write_text(json.dumps(dataclasses.asdict(outcome), indent=1) + "\n")
     return outcome
 
 
@@ -119,7 +119,8 @@ def run_trials(trials: list[Trial], output: Path, *, quiet: bool = True) -> Iter
         if new:
             durations.append(time.monotonic() - begin)
             todo -= 1
-            left = f"  [{clock(durations[-1])}; about {clock(todo * statistics.median(durations))} left]"
+            rest = timedelta(seconds=round(todo * statistics.median(durations)))
+            left = f"  [{durations[-1]:.0f} s; about {rest} left]"
         title = f"{number}/{len(trials)} {trial.scene.stem}, {trial.name}"
         print(f"{title}: {summary(outcome)}{left}", flush=True)
         yield trial, outcome
@@ -141,18 +142,6 @@ def summary(outcome: Outcome) -> str:
     mesh, loops = outcome.scores["mesh"], outcome.scores["mesh"]["boundary_loops"]
     return (f"loops {loops['found']} of {loops['reference']}, chamfer {mesh['chamfer']:.3f} %, "
             f"{outcome.scores['mean']['psnr']:.2f} dB")
-
-
-def clock(seconds: float) -> str:
-    """Hours, minutes and seconds, as much as matters.
-
-    >>> clock(42.4), clock(150), clock(5400)
-    ('42 s', '2 min 30 s', '1 h 30 min')
-    """
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes >= 60:
-        return f"{minutes // 60} h {minutes % 60} min"
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 def _render_views(reference: Path, sensors: Path, folder: Path) -> None:
