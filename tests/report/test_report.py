@@ -36,7 +36,8 @@ def folder(tmp_path_factory):
     (folder / "metrics.json").write_text(json.dumps({
         "scene": "ball <&>.xml", "psnr_training": 31.25, "psnr_per_view": {"view_000": 31.5},
         "counts": asdict(topology(mesh.vertices, mesh.faces)), "seconds": {"hull": 1.0, "total": 1.0},
-        "versions": {"gshell_mi": "0"}, "variant": "llvm_ad_rgb", "config": asdict(FitConfig())}))
+        "versions": {"gshell_mi": "0"}, "warnings": ["1 floater <here>"], "diagnostics": {"floaters": 1},
+        "peak_memory_mib": 900, "variant": "llvm_ad_rgb", "config": asdict(FitConfig())}))
     lines = [{"stage": "joint", "iteration": i, "loss": 0.1 / (i + 1), "psnr": 20 + i, "seconds": 0.1}
              for i in range(5)]
     (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -50,6 +51,8 @@ def test_page_is_self_contained(folder):
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert sources and all(source.startswith("data:") for source in sources)
     assert "ball &lt;&amp;&gt;" in page, "names are escaped"
+    assert "1 floater &lt;here&gt;" in page, "warnings are told"
+    assert "<td>diagnostics.floaters</td><td>1</td>" in page and "<td>peak_memory_mib</td><td>900</td>" in page
     assert "31.25 dB" in page and "view_000: target | fit, 31.50 dB" in page and "view_002" in page
     assert "ghost_iterations" in text and "seconds.hull" in text
 
