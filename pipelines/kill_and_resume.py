@@ -1,13 +1,14 @@
 """Kills a fit with SIGKILL at random moments, resumes it each time, and compares the end with whole fits.
 
-    python pipelines/kill_and_resume.py SCENE.xml WORK [--kills 10] [--whole 3] [--seed 0] [-- FIT OPTIONS]
+    python pipelines/kill_and_resume.py SCENE.xml WORK [--kills 10] [--whole 3] [--one-core] [-- OPTIONS]
 
 Whole fits come first; the last of them tells how long each part of a fit takes. Then a fit is started and
 killed at ``--kills`` moments drawn uniformly from that time, from the start of the process to the report;
 after each kill every file in the folder is read, and the fit goes on with ``--resume`` (or from the start, if
 it was killed before its first checkpoint). At the end the differences of the killed fit to the whole ones are
 printed beside those of the whole ones to each other: threads add up in an order that changes, so no two fits
-are the same. Exit code 1 if on average the killed fit is farther from the whole ones than any two of these.
+are the same. With ``--one-core`` there is but one thread, whole fits are equal to the last bit, and so must be
+the killed one. Exit code 1 if on average the killed fit is farther from the whole ones than any two of these.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import os
 import random
 import shutil
 import signal
@@ -22,6 +24,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -52,12 +55,13 @@ class Moment:
 class Run:
     """The command ``python -m gshell_mi.fit`` in a process of its own, watched from outside."""
 
-    def __init__(self, scene: Path, output: Path, options: list[str]):
+    def __init__(self, scene: Path, output: Path, options: list[str], *, one_core: bool = False):
         self.output, self.begin = output, time.time()
         resume = ["--resume"] if (output / "checkpoint.npz").exists() else []
         command = [sys.executable, "-m", "gshell_mi.fit", str(scene), "-o", str(output), "--quiet"]
         self.process = subprocess.Popen([*command, *options, *resume], stdout=subprocess.DEVNULL,
-                                        stderr=subprocess.PIPE, text=True)
+                                        stderr=subprocess.PIPE, text=True,
+                                        preexec_fn=_stay_on_one_core if one_core else None)
 
     def reached(self) -> tuple[int, int]:
         """Steps logged, and files of the ending that this process has written."""
@@ -101,6 +105,10 @@ class Run:
         self.process.kill()
         self.process.communicate()
         return self.process.returncode == -signal.SIGKILL
+
+
+def _stay_on_one_core() -> None:
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
 def moments(course: list[tuple[float, tuple[int, int]]], count: int, rng: random.Random) -> list[Moment]:
@@ -155,22 +163,23 @@ def differences(first: Path, second: Path) -> dict[str, float]:
             "PSNR dB": abs(psnr[0] - psnr[1]), "vertices": abs(len(a) - len(b))}
 
 
-def study(scene: Path, work: Path, options: list[str], *, kills: int, whole: int,
-          seed: int) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
+def study(scene: Path, work: Path, options: list[str], *, kills: int, whole: int, seed: int,
+          one_core: bool = False) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
     """Runs it all; the differences of the whole fits to each other, and of the killed one to them."""
     fits = [work / f"whole_{number}" for number in range(whole)]
     for folder in (*fits, work / "killed"):
         shutil.rmtree(folder, ignore_errors=True)
+    run = partial(Run, scene, options=options, one_core=one_core)
     # The first one compiles what the others find in Dr.Jit's cache, so its time tells little.
     for folder in fits[:-1]:
-        Run(scene, folder, options).wait()
-    course = Run(scene, fits[-1], options).timeline()
+        run(folder).wait()
+    course = run(fits[-1]).timeline()
     killed = work / "killed"
     for moment in moments(course, kills, random.Random(seed)):
-        if Run(scene, killed, options).kill_at(moment):
+        if run(killed).kill_at(moment):
             print(f"killed {moment.seconds:.2f} s after {moment.steps} steps and {moment.files} files of the "
                   f"ending; {read_everything(killed) if killed.exists() else 0} files are whole", flush=True)
-    Run(scene, killed, options).wait()
+    run(killed).wait()
     read_everything(killed)
     return ([differences(a, b) for a, b in itertools.combinations(fits, 2)],
             [differences(killed, folder) for folder in fits])
@@ -189,13 +198,14 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=10, help="kills of the one fit (default 10)")
     parser.add_argument("--whole", type=int, default=3, help="fits that nothing kills (default 3)")
     parser.add_argument("--seed", type=int, default=0, help="of the moments (default 0)")
+    parser.add_argument("--one-core", action="store_true", help="one thread, where all must be equal (Linux)")
     own, options = sys.argv[1:], []
     if "--" in own:
         own, options = own[:own.index("--")], own[own.index("--") + 1:]
     given = parser.parse_args(own)
     mi.set_variant("llvm_ad_rgb")
     between, to_killed = study(given.scene, given.work, options, kills=given.kills, whole=given.whole,
-                               seed=given.seed)
+                               seed=given.seed, one_core=given.one_core)
     for name in between[0]:
         a, b = ([entry[name] for entry in entries] for entries in (between, to_killed))
         print(f"{name}: whole fits differ by {np.mean(a):.3g} (at most {max(a):.3g}), "
