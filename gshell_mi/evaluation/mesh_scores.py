@@ -58,6 +58,7 @@ def mesh_scores(mesh: trimesh.Trimesh, reference: trimesh.Trimesh, samples: int 
     precision, recall = ((d < F_SCORE_DISTANCE * diagonal).mean() for d in (accuracy, completeness))
     cosine = np.abs((reference.face_normals[face_b] * mesh.face_normals[face_a[nearest]]).sum(1))
     percent = 100 / diagonal
+    found, true = (topology(np.asarray(m.vertices), np.asarray(m.faces)) for m in (mesh, reference))
     return {
         "chamfer": float(percent * (accuracy.mean() + completeness.mean()) / 2),
         "chamfer_floor": float(percent * floor.mean()),
@@ -66,7 +67,7 @@ def mesh_scores(mesh: trimesh.Trimesh, reference: trimesh.Trimesh, samples: int 
         "f_score": float(2 * precision * recall / max(precision + recall, 1e-12)),
         "normal_consistency": float(cosine.mean()),
         "winding_difference": _winding_difference(mesh, reference, seed),
-        **{name: {"found": getattr(_topology(mesh), name), "reference": getattr(_topology(reference), name)}
+        **{name: {"found": getattr(found, name), "reference": getattr(true, name)}
            for name in ("boundary_loops", "pinholes", "boundary_length", "components", "nonmanifold_edges")},
     }
 
@@ -82,7 +83,3 @@ def _winding_difference(mesh: trimesh.Trimesh, reference: trimesh.Trimesh, seed:
     unit = np.random.default_rng(seed).uniform(-0.5, 0.5, (_WINDING_SAMPLES, 3))
     points = reference.bounds.mean(0) + _WINDING_MARGIN * reference.extents * unit
     return float(np.abs(winding_numbers(mesh, points) - winding_numbers(reference, points)).mean())
-
-
-def _topology(mesh: trimesh.Trimesh):
-    return topology(np.asarray(mesh.vertices), np.asarray(mesh.faces))

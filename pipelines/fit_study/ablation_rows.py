@@ -22,8 +22,6 @@ class Row:
         return dataclasses.replace(base, **self.changes)
 
 
-#: So small that (I + lambda L)^-1 is the identity.
-_NO_SMOOTHING = 1e-6
 #: Accepts whatever was tried.
 _ALWAYS = 1e9
 
@@ -38,7 +36,7 @@ ROWS = [
             ("seed-1", "another seed", {"seed": 1}),
             ("seed-2", "a third seed", {"seed": 2})),
     *_group("Visual hull",
-            ("hull-plain", "every daylight carves", {"hull_daylight_votes": 0.0}),
+            ("hull-plain", "daylight that two views see carves", {"hull_daylight_votes": 0.0}),
             ("hull-filled", "no enclosed daylight carves", {"hull_daylight_votes": 1.0})),
     *_group("Openings by the radiance ghost",
             ("no-openings", "none accepted", {"ghost_gain": 0.0}),
@@ -56,8 +54,7 @@ ROWS = [
     *_group("Geometry in the joint stage",
             ("no-joint", "no joint stage", {"iterations": 0}),
             ("fixed-geometry", "only material and light", {"geometry_lr": 0.0, "deform_lr": 0.0}),
-            ("no-sobolev", "no Sobolev gradient",
-             {"geometry_smoothing": _NO_SMOOTHING, "geometry_detail": _NO_SMOOTHING}),
+            ("no-sobolev", "no Sobolev gradient", {"geometry_smoothing": 0.0}),
             ("fine-only", "smoothing 0.5 throughout", {"geometry_smoothing": 0.5}),
             ("coarse-only", "smoothing 8 throughout", {"geometry_detail": 8.0}),
             ("no-offsets", "no vertex offsets", {"deform_lr": 0.0}),
