@@ -43,7 +43,7 @@ def reference() -> str:
 def _rows(arguments: type) -> list[str]:
     rows = []
     types = typing.get_type_hints(arguments, include_extras=True)
-    texts = _field_texts(arguments)
+    texts = field_texts(arguments)
     for field in dataclasses.fields(arguments):
         kind = types[field.name]
         inner = typing.get_args(kind)[0] if typing.get_origin(kind) is typing.Annotated else kind
@@ -68,7 +68,7 @@ def _default(field: dataclasses.Field) -> str:
     return f"`{'on' if field.default is True else field.default}`"
 
 
-def _field_texts(arguments: type) -> dict[str, str]:
+def field_texts(arguments: type) -> dict[str, str]:
     """The docstring under each field."""
     body = ast.parse(textwrap.dedent(inspect.getsource(arguments))).body[0].body
     texts = {}

@@ -7,7 +7,7 @@ killed at ``--kills`` moments drawn uniformly from that time, from the start of 
 after each kill every file in the folder is read, and the fit goes on with ``--resume`` (or from the start, if
 it was killed before its first checkpoint). At the end the differences of the killed fit to the whole ones are
 printed beside those of the whole ones to each other: threads add up in an order that changes, so no two fits
-are the same. With ``--one-core`` there is but one thread, whole fits are equal to the last bit, and so must be
+are the same. With ``--one-core`` there is one thread, whole fits are equal to the last bit, and so must be
 the killed one. Exit code 1 if on average the killed fit is farther from the whole ones than any two of these.
 """
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from ..errors import UserError
 
-#: Fields that are weights of losses.
-WEIGHTS = ("ghost_mask", "ghost_daylight", "ghost_binary", "ghost_closing", "ghost_chroma", "joint_mask",
-           "joint_depth", "hole_opening", "hole_closing", "visible_outside", "visible_inside", "sdf_sign",
-           "eikonal", "template_smoothness", "material_smoothness", "albedo_chroma", "light_smoothness",
-           "light_grey", "flexicubes_deviation")
+#: Least sensible value of a number, where that is not 0.
+_LEAST = {"resolution": 4, "start_resolution": 4, "band_resolution": 4, "triptychs": 1, "ghost_iterations": 1,
+          "ghost_batch": 1, "ghost_sheets": 1, "spp": 1, "primal_spp": 1, "max_depth": 2, "reparam_depth": 1,
+          "light_height": 3}
+
+#: Greatest sensible value, where there is one.
+_MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "warmup": 1, "reparam_depth": 3}
 
 #: What ``--preview`` saves time with.
 _PREVIEW = {"resolution": 48, "ghost_batch": 16384, "refinement_iterations": 0, "iterations": 25, "spp": 4,
@@ -92,7 +95,7 @@ class FitConfig:
     refinement_smoothing: float = 400.0
     """Lambda of the Sobolev gradient on the template when it starts to move: whole parts move first."""
     refinement_detail: float = 150.0
-    """Lambda at the end; falls geometrically."""
+    """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
     refinement_radiance_lr: float = 0.05
     """Adam's step for the radiance meanwhile."""
     refinement_outline: float = 0.001
@@ -127,7 +130,7 @@ class FitConfig:
     """Lambda of the Sobolev gradient (I + lambda L)^-1 on the lattice when the geometry starts to move: whole
     parts move first, details last."""
     geometry_detail: float = 0.5
-    """Lambda at the end; falls geometrically."""
+    """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
     material_gradient_smoothing: float = 1.0
     """Lambda of the material's Sobolev gradient on the lattice; spreads colour to what few pixels see."""
     material_lr: float = 0.05
@@ -186,28 +189,16 @@ class FitConfig:
         return self.fixed_material or self.geometry_only
 
     def __post_init__(self):
-        for name in ("ghost_iterations", "ghost_batch", "ghost_sheets", "spp", "primal_spp", "light_height",
-                     "triptychs"):
-            if getattr(self, name) < 1:
-                raise UserError(f"--{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}.")
-        for name in ("resolution", "start_resolution"):
-            cells = getattr(self, name)
-            if cells is not None and cells < 4:
-                raise UserError(f"--{name.replace('_', '-')} must be at least 4 cells, not {cells}.")
-        if self.checkpoint_seconds < 0:
-            raise UserError(f"--checkpoint-seconds must not be negative, and is {self.checkpoint_seconds:g}.")
-        for name in ("iterations", "refinement_iterations"):
-            if getattr(self, name) < 0:
-                flag = f"--{name.replace('_', '-')}"
-                raise UserError(f"{flag} must not be negative, and is {getattr(self, name)}.")
-        for name in WEIGHTS:
-            if getattr(self, name) < 0:
-                raise UserError(f"--{name.replace('_', '-')} is a weight and must not be negative, "
-                                f"and is {getattr(self, name):g}.")
-        if self.max_depth < 2:
-            raise UserError(f"--max-depth must be at least 2 (direct light), not {self.max_depth}.")
-        if not 0 <= self.warmup <= 1:
-            raise UserError(f"--warmup is a fraction between 0 and 1, not {self.warmup}.")
+        for name, value in vars(self).items():
+            if isinstance(value, str | bool | None):
+                continue
+            flag, least, most = f"--{name.replace('_', '-')}", _LEAST.get(name, 0), _MOST.get(name)
+            if not math.isfinite(value):
+                raise UserError(f"{flag} must be a finite number, not {value}.")
+            if value < least:
+                raise UserError(f"{flag} must be at least {least}, not {value}.")
+            if most is not None and value > most:
+                raise UserError(f"{flag} must be at most {most}, not {value}.")
 
 
 def default_output(scene: Path) -> Path:

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from .. import losses
+from ..errors import UserError
 from ..fields.smoothing import LatticeDiffusion
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, principled
@@ -17,6 +18,9 @@ from .config import FitConfig
 from .observer import Preview
 from .opening import without_specks
 from .regularisers import Regularisers
+
+#: Between the first sampler seeds of fits whose seeds are neighbours: no step shares its samples.
+_SEEDS_APART = 1 << 20
 
 #: Steps after which blocks that the surface has left are dropped.
 _RESCAN = 50
@@ -71,16 +75,21 @@ class JointStage:
         return self.geometry.optimizers | {"shading": self.shading}
 
     def step(self, iteration: int) -> dict[str, float]:
-        """One step on one view; returns the losses."""
+        """One step on one view; returns the losses.
+
+        Raises:
+            UserError: the steps before have left no surface.
+        """
         config = self.config
         moving = iteration >= config.warmup * config.iterations or not self.shading.state
         with phase("scene update"):
             self._apply(geometry=moving)
         index = self._view(iteration)
+        seed = (config.seed * _SEEDS_APART + 2 * iteration) % 2**32
         with phase("render") as compute:
             image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[index],
                               integrator=self._integrator, spp=config.primal_spp, spp_grad=config.spp,
-                              seed=2 * iteration, seed_grad=2 * iteration + 1)
+                              seed=seed, seed_grad=seed + 1)
             compute(image)
         target = self._targets[index]
         with phase("losses") as compute:
@@ -141,6 +150,10 @@ class JointStage:
             self.light.log_radiance = self.shading["light"]
             self.light.update(self.parameters)
         self.parameters.update()
+        if self.subject.surface.is_empty:
+            raise UserError("The joint stage has left no surface; start again with --overwrite and a smaller "
+                            "--geometry-lr, or less weight on what opens it (--hole-opening, "
+                            "--visible-outside).")
 
     def _follow_surface(self, *, rescan: bool) -> None:
         """Moves the blocks that the fields are stored in, and all that is stored with them."""

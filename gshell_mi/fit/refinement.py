@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from .. import losses
-from ..fields.smoothing import MeshDiffusion
+from ..fields.smoothing import MeshDiffusion, falling
 from .config import FitConfig
 from .observer import Preview
 from .outlines import Outlines
@@ -84,9 +84,8 @@ class PhotometricRefinement:
         config, optimizer = self.config, self.optimizer
         if self._diffuse is None or iteration % _FACTORISE_EVERY == 0:
             start = (iteration - iteration % _FACTORISE_EVERY) / config.refinement_iterations
-            ratio = config.refinement_detail / config.refinement_smoothing
-            self._diffuse = MeshDiffusion(self.faces, self.ghost.vertex_count,
-                                          config.refinement_smoothing * ratio**start)
+            smoothing = falling(config.refinement_smoothing, config.refinement_detail, start)
+            self._diffuse = MeshDiffusion(self.faces, self.ghost.vertex_count, smoothing)
         gradient = dr.grad(optimizer["positions"])
         gradient = self._diffuse(dr.select(dr.isfinite(gradient), gradient, 0))
         dr.set_grad(optimizer["positions"], gradient)

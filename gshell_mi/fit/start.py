@@ -30,8 +30,11 @@ def check_given(scene: FitScene, config: FitConfig) -> None:
     """Whether the scene gives what the modes of the fit take from it.
 
     Raises:
-        UserError: the material is to be kept, but there is none.
+        UserError: the material is to be kept, but there is none; or the given fields hold no surface.
     """
+    if scene.subject.surface.is_empty:
+        raise UserError(f"The fields '{scene.subject.filename}' of the gshell shape hold no surface; leave "
+                        f"'filename' out of '{scene.path}' or give others.")
     if config.material_is_given and not given_material(scene.bsdf):
         mode = "--geometry-only" if config.geometry_only else "--fixed-material"
         raise UserError(f"{mode} keeps the material of the gshell shape, but '{scene.path}' gives it no "

@@ -7,8 +7,10 @@ import mitsuba as mi
 
 
 def mean(x) -> mi.Float:
-    """Mean over every entry of an array, colour or tensor."""
+    """Mean over every entry of an array, colour or tensor; 0 if there is none, as of a mesh without faces."""
     flat = dr.ravel(x) if not dr.is_tensor_v(x) else x.array
+    if dr.width(flat) == 0:
+        return mi.Float(0)
     return dr.mean(flat) if dr.depth_v(flat) == 1 else flat
 
 

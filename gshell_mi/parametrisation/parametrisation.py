@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from ..extraction.surface_mesh import gather
 from ..fields.carried import Carried
+from ..fields.smoothing import falling
 
 #: Values per lattice vertex of the fields that live there; the weights of FlexiCubes belong to cubes.
 CHANNELS = {"sdf": 1, "msdf": 1, "deform": 3}
@@ -27,14 +28,14 @@ class StepRules:
     smoothing: float = 8.0
     """Lambda of the Sobolev gradient on the lattice at the start; only where lattice values are optimised."""
     detail: float = 0.5
-    """Lambda at the end; falls geometrically."""
+    """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
 
     def decay(self, progress: float) -> float:
         """Factor of all rates at ``progress`` in [0, 1]."""
         return 0.1**progress
 
     def smoothing_at(self, progress: float) -> float:
-        return self.smoothing * (self.detail / self.smoothing) ** progress
+        return falling(self.smoothing, self.detail, progress)
 
 
 class Parametrisation(ABC):

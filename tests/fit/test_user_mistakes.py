@@ -1,6 +1,7 @@
 """What the command says of mistakes: exit code 2, one sentence on stderr that names the culprit."""
 
 import errno
+import json
 import os
 import re
 import shutil
@@ -11,7 +12,10 @@ import numpy as np
 import pytest
 from bowl import CLOSED, SHORT, SIZE
 
+from gshell_mi.errors import UserError
+from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
+from gshell_mi.fit.checkpoint import Checkpoint
 
 
 @pytest.fixture
@@ -192,6 +196,46 @@ def test_setting_out_of_range(told, option, value):
 def test_no_material_to_keep(told, scene, mode):
     sentence = f"{mode} keeps the material of the gshell shape, but '{scene}' gives it no uniform one"
     assert sentence in told(mode)
+
+
+def test_every_number_has_its_bounds():
+    """NaN, infinity and negative numbers make no sense anywhere; 0 switches off or is refused."""
+    numbers = {name: value for name, value in vars(FitConfig(resolution=64)).items()
+               if isinstance(value, int | float) and not isinstance(value, bool)}
+    assert len(numbers) > 50
+    for name, value in numbers.items():
+        flag = f"--{name.replace('_', '-')} "
+        impossible = [-1] if isinstance(value, int) else [-0.1, np.nan, np.inf]
+        for wrong in impossible:
+            with pytest.raises(UserError, match=f"^{flag}must be"):
+                FitConfig(**{name: wrong})
+
+
+def test_smoothing_and_rates_of_0_switch_off(bowl_scene, tmp_path):
+    off = [word for name in ("ghost-smoothing", "refinement-smoothing", "refinement-lr",
+                             "refinement-radiance-lr", "geometry-smoothing", "geometry-detail", "geometry-lr",
+                             "deform-lr", "material-gradient-smoothing", "material-lr", "light-lr",
+                             "checkpoint-seconds", "hull-daylight-votes", "ghost-min-area", "warmup")
+           for word in (f"--{name}", "0")]
+    assert main([str(bowl_scene), "-o", str(tmp_path), *SHORT, *CLOSED, "--iterations", "3", *off]) == 0
+    losses = [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert np.isfinite(losses).all()
+
+
+def test_no_surface_left(told, scene, tmp_path):
+    sentence = told(*CLOSED, "--refinement-iterations", "0", "--warmup", "0", "--hole-opening", "1e6",
+                    "--geometry-lr", "2", whole=True)
+    assert "has left no surface; start again with --overwrite and a smaller --geometry-lr" in sentence
+    output = tmp_path / "out"
+    assert Checkpoint.load(output / "checkpoint.npz").stage == "joint", "nothing is lost"
+    assert not (output / "metrics.json").exists() and not list(output.glob(".*"))
+
+
+def test_given_fields_without_a_surface(told, scene):
+    np.savez(scene.parent / "air.npz", sdf=np.ones(21**3, np.float32))
+    change(scene, '<integer name="resolution" value="20"/>',
+           f'<string name="filename" value="{scene.parent / "air.npz"}"/>')
+    assert "air.npz' of the gshell shape" in told() and "hold no surface" in told()
 
 
 def test_nothing_opaque(told, monkeypatch):

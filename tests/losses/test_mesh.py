@@ -18,6 +18,12 @@ def test_edge_smoothness():
     assert value(losses.edge_smoothness(colors, faces)) == pytest.approx((1 + 2 + 3) / 3 / 2 / 3)
 
 
+def test_a_mesh_without_faces_is_smooth():
+    faces = mi.Vector3u([], [], [])
+    assert value(losses.edge_smoothness(mi.Color3f([], [], []), faces)) == 0
+    assert value(losses.normal_variation(mi.Vector3f([], [], []), faces)) == 0
+
+
 def test_normal_variation():
     """Normals of a fold of 90 degrees: difference sqrt 2 along two of three edges; none on a plane."""
     faces = mi.Vector3u([0], [1], [2])
