@@ -23,7 +23,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "pipelines"))
 from scene_builder import files
 
 CASES = ("32:24:128", "64:24:128", "64:48:256", "128:24:256", "64:12:800")
-SHORT = ("--ghost-iterations", "15", "--ghost-gain", "2", "--refinement-iterations", "6",
+SHORT = ("--ghost-iterations", "15", "--ghost-gain", "2", "--carving-iterations", "10",
+         "--refinement-iterations", "6",
          "--refinement-gain", "9", "--iterations", "12")
 
 

@@ -11,15 +11,15 @@ from ..errors import UserError
 
 #: Least sensible value of a number, where that is not 0.
 _LEAST = {"resolution": 4, "start_resolution": 4, "band_resolution": 4, "triptychs": 1, "ghost_iterations": 1,
-          "ghost_batch": 1, "ghost_sheets": 1, "spp": 1, "primal_spp": 1, "max_depth": 2, "reparam_depth": 1,
+          "ghost_batch": 1, "ghost_sheets": 1, "carving_batch": 1, "spp": 1, "primal_spp": 1, "max_depth": 2, "reparam_depth": 1,
           "light_height": 3}
 
 #: Greatest sensible value, where there is one.
 _MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "warmup": 1, "reparam_depth": 3}
 
 #: What ``--preview`` saves time with.
-_PREVIEW = {"resolution": 48, "ghost_batch": 16384, "refinement_iterations": 0, "iterations": 25, "spp": 4,
-            "primal_spp": 4, "max_depth": 2, "light_height": 16, "triptychs": 4}
+_PREVIEW = {"resolution": 48, "ghost_batch": 16384, "carving_iterations": 0, "refinement_iterations": 0,
+            "iterations": 25, "spp": 4, "primal_spp": 4, "max_depth": 2, "light_height": 16, "triptychs": 4}
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,16 @@ class FitConfig:
     """An opening stays if the image error through it is below this fraction of what it is when closed."""
     ghost_min_area: float = 0.005
     """Holes and islands smaller than this fraction of the template's area are noise and are undone."""
+
+    # --- carving: folds and hollows that the hull bridges
+    carving_iterations: int = 500
+    """Steps of the radiance volume; 0 leaves the hull as it is."""
+    carving_batch: int = 65536
+    """Pixels per step, drawn over all views; those whose rays miss the hull cost little."""
+    carving_lr: float = 0.6
+    """Adam's step for the density's logits; halves over the coarse steps, then falls tenfold."""
+    carving_radiance_lr: float = 0.05
+    """Adam's step for the radiance, as a fraction of the targets' mean."""
 
     # --- photometric refinement: moves the surface inside the hull
     refinement_iterations: int = 160

@@ -140,7 +140,7 @@ class RadianceGhost:
             for step in range(_ERROR_STEPS):
                 sample = pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
                 ray = self.views.rays(sample.view, sample.film)
-                radiance, _ = self.composite(self._sheets(ray), ray.d)
+                radiance, _ = self.composite(self.sheets(ray), ray.d)
                 total += losses.log_l1(radiance, sample.radiance)
                 dr.eval(total)
         return float(total[0]) / _ERROR_STEPS
@@ -168,7 +168,7 @@ class RadianceGhost:
         """The random pixels of a step, the rays through them and the sheets that these meet."""
         sample = self.pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
         ray = self.views.rays(sample.view, sample.film)
-        return sample, ray, self._sheets(ray)
+        return sample, ray, self.sheets(ray)
 
     def update(self, names: tuple[str, ...], rate: float) -> None:
         """Steps the parameters ``names`` and the lobe; the others rest.
@@ -206,7 +206,7 @@ class RadianceGhost:
         kept = dr.detach(self.optimizer["opacity"]).numpy() > 2 * _INITIAL_LOGIT
         return Preview(vertices, faces[kept[faces].all(axis=1)], self.radiance()[0], vertices, faces)
 
-    def _sheets(self, ray: mi.Ray3f) -> list[tuple]:
+    def sheets(self, ray: mi.Ray3f) -> list[tuple]:
         """The first sheets along each ray: (hit?, vertex indices, barycentric weights, front side?)."""
         sheets = []
         active = dr.full(mi.Bool, True, dr.width(ray.o))

@@ -20,7 +20,7 @@ from ..export.asset import write_asset
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..fields.lattice_fields import closed_at_border
-from ..fields.thin_parts import back_on_solid, thickened_field, thin_part_refinement
+from ..fields.thin_parts import thickened_field, thin_part_refinement
 from ..fields.visual_hull import visual_hull
 from ..files import replacing
 from ..lattice import make_lattice
@@ -28,11 +28,13 @@ from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
 from ..scene import load_fit_scene
 from ..views import PinholeViews
+from .carving import carve
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
 from .config import FitConfig, default_output
 from .depth import check_depth
 from .field_fitting import FieldFitting
 from .findings import findings
+from .ghost_template import ghost_template, length_scale
 from .interrupt import Interrupt
 from .joint import JointStage
 from .memory import MemoryEstimate
@@ -42,6 +44,7 @@ from .outlines import Outlines
 from .pixels import PixelPool
 from .progress import Progress
 from .radiance_ghost import RadianceGhost
+from .radiance_volume import RadianceVolume
 from .recast import recast
 from .refinement import PhotometricRefinement
 from .start import TYPICAL_REFLECTANCE, block_arrays, check_given, start_fields, start_light, start_material
@@ -55,7 +58,7 @@ _HOLD_OUT = 8
 #: Between two checkpoints at least this many times what writing one takes.
 _CHECKPOINT_PAUSE = 10
 
-STAGES = ("hull", "ghost", "refinement", "field", "joint", "done")
+STAGES = ("hull", "ghost", "carving", "refinement", "field", "joint", "done")
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,8 @@ class _Fit:
             self._rewind_log()
             if self.checkpoint.stage == "ghost":
                 self._ghost()
+            if self.checkpoint.stage == "carving":
+                self._carve()
             if self.checkpoint.stage == "refinement":
                 self._refine()
             joint = self._joint()
@@ -179,7 +184,7 @@ class _Fit:
             world = visual_hull(points, self.views, [target.rgba[..., 3] for target in self.scene.targets],
                                 daylight_votes=self.config.hull_daylight_votes, progress=advance)
             cell = self.lattice.spacing
-            fine = np.clip(world.numpy() / _length_scale(self.scene.subject.to_world), -1, 1) / cell
+            fine = np.clip(world.numpy() / length_scale(self.scene.subject.to_world), -1, 1) / cell
             grown, hull = thickened_field(fine.reshape((lattice.stride,) * 3), finer)
             sdf, hull = (closed_at_border(cell * field, self.lattice) for field in (grown, hull))
         if not (sdf < 0).any():
@@ -221,7 +226,7 @@ class _Fit:
         radiance, known = splat_to_lattice(mi.Float(front.ravel()), template, self.lattice)
         light = float(np.median(front[~opened].mean(axis=1)))
         radiance = radiance.numpy().reshape(-1, 3)
-        self._enter("refinement", sdf=state["sdf"], hull=state["hull"], msdf=msdf.numpy(), radiance=radiance,
+        self._enter("carving", sdf=state["sdf"], hull=state["hull"], msdf=msdf.numpy(), radiance=radiance,
                     known=known.numpy(), light=np.float32(light / TYPICAL_REFLECTANCE))
 
     def _openings(self, ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -230,18 +235,30 @@ class _Fit:
         return clean(close_unjustified(clean(ghost.smoothed_logits()), faces, ghost.image_error,
                                        self.config.ghost_gain))
 
+    def _carve(self) -> None:
+        """Hollows out what the hull bridges."""
+        state, count = self.checkpoint.arrays, self.config.carving_iterations
+        carved = None
+        # The volume lives on a lattice of cubes.
+        if count and self.lattice.vertex_count == self.lattice.stride**3:
+            _, vertices, faces = self._template(state["hull"])
+            known, unknown = self._split_pixels()
+            volume = RadianceVolume(state["hull"].reshape((self.lattice.stride,) * 3), vertices, faces,
+                                    self.scene.subject.to_world, self.views, known, self.config,
+                                    self.checkpoint.iteration)
+            self._iterate("carving", count, volume, volume.optimizers, state)
+            with self.progress.stage("hollows", None), self._timed("carving"):
+                carved = carve(self.scene.subject, state, volume, known, unknown)
+        self.checkpoint.facts["carved"] = carved is not None
+        kept = {name: state[name] for name in ("hull", *_SURFACE)}
+        self._enter("refinement", **(kept | (carved or {})), light=state["light"])
+
     def _refine(self) -> None:
         """Moves the template inside the hull, and the fields with it."""
         state = self.checkpoint.arrays
-        template, vertices, faces = self._template(state["sdf"])
-        logits, excess = (template.interpolate(mi.Float(state[name])).numpy() for name in ("msdf", "hull"))
-        solid = logits > 0
-        scale = _length_scale(self.scene.subject.to_world)
-        start = back_on_solid(vertices, faces, np.where(solid, scale * excess, 0))
-        every = np.arange(len(self.views))
-        held_out = every[::_HOLD_OUT]
-        seen = np.setdiff1d(every, held_out) if len(every) > 1 else every
-        known, unknown = (PixelPool(self.views, self.scene.targets, chosen) for chosen in (seen, held_out))
+        template = ghost_template(self.scene.subject, state)
+        vertices, faces, solid, start = template.vertices, template.faces, template.solid, template.start
+        known, unknown = self._split_pixels()
         ghost = RadianceGhost(start, faces, self.views, known, self.config, glossy=True)
         for _ in range(3):
             ghost.refit(solid)
@@ -250,7 +267,7 @@ class _Fit:
         if self.pixels.has_alpha:
             alphas = [target.rgba[..., 3] for target in self.scene.targets]
             outlines = Outlines(self.views, alphas, faces, solid)
-        cell = self.lattice.spacing * scale
+        cell = self.lattice.spacing * length_scale(self.scene.subject.to_world)
         refinement = PhotometricRefinement(ghost, start, faces, outlines, cell, self.config)
         self._iterate("refinement", self.config.refinement_iterations, refinement,
                       {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
@@ -264,10 +281,18 @@ class _Fit:
             if (moved != vertices).any():
                 before = LatticeFields.closed(state["sdf"], self.lattice.grid)
                 self.scene.subject.set_fields(dataclasses.replace(before, msdf=state["msdf"]))
-                fields = recast(self.scene.subject, vertices, moved, faces, logits / self.lattice.spacing,
+                fields = recast(self.scene.subject, vertices, moved, faces, template.logits,
                                 ghost.radiance()[0], self.config.ghost_min_area)
         self.checkpoint.facts["refinement_kept"] = kept and fields is not None
         self._enter("joint", **(fields or {name: state[name] for name in _SURFACE}), light=state["light"])
+
+    def _split_pixels(self) -> tuple[PixelPool, PixelPool]:
+        """Pixels to learn the shape from, and those of views kept apart to judge it."""
+        every = np.arange(len(self.views))
+        held_out = every[::_HOLD_OUT]
+        seen = np.setdiff1d(every, held_out) if len(every) > 1 else every
+        known, unknown = (PixelPool(self.views, self.scene.targets, chosen) for chosen in (seen, held_out))
+        return known, unknown
 
     def _template(self, sdf: np.ndarray) -> tuple[SurfaceMesh, np.ndarray, np.ndarray]:
         """The template that is where ``sdf`` changes sign, its vertices and its faces."""
@@ -397,11 +422,6 @@ class _Fit:
         with open(self.output / "log.jsonl", "a") as log:
             log.write(json.dumps({"stage": stage, "iteration": iteration, **rounded,
                                   "seconds": round(seconds, 4)}) + "\n")
-
-
-def _length_scale(to_world: mi.ScalarTransform4f) -> float:
-    """World units per lattice unit: the cube root of the transform's volume ratio."""
-    return float(abs(np.linalg.det(np.array(to_world.matrix)[:3, :3])) ** (1 / 3))
 
 
 def _plain(config: FitConfig) -> dict:

@@ -33,8 +33,8 @@ def test_preview_is_less_work_in_every_respect(given):
     assert usual.config == FitConfig() and usual.report
     assert rough.config == FitConfig.preview() and not rough.report
     assert rough.config.resolution < 64
-    for name in ("ghost_batch", "refinement_iterations", "iterations", "spp", "primal_spp", "max_depth",
-                 "light_height", "triptychs"):
+    for name in ("ghost_batch", "carving_iterations", "refinement_iterations", "iterations", "spp",
+                 "primal_spp", "max_depth", "light_height", "triptychs"):
         assert getattr(rough.config, name) < getattr(usual.config, name), name
     assert rough.config.ghost_iterations == usual.config.ghost_iterations, "openings need their time"
 

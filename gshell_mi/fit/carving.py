@@ -1,0 +1,115 @@
+"""Carving: the template is hollowed out where that explains views better that nothing was fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import ndimage
+
+from .. import losses
+from ..topology import topology
+from .ghost_template import GhostTemplate, ghost_template
+from .hollows import hollows
+from .opening import clean_opacity, msdf_from_template, splat_to_lattice
+from .pixels import PixelPool
+from .radiance_ghost import RadianceGhost
+from .radiance_volume import RadianceVolume
+
+#: A hollow is kept if the error of rays that see into it falls below this fraction.
+_GAIN = 0.95
+
+#: Rays see into a hollow if they go this much farther than to the hull, in cells.
+_DEEPER = 0.7
+
+#: Batches of rays that judge.
+_ERROR_STEPS = 20
+
+
+def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], volume: RadianceVolume, known: PixelPool,
+          unknown: PixelPool) -> dict[str, np.ndarray] | None:
+    """Hollows out a template as far as unseen views are explained better.
+
+    Args:
+        subject: the gshell shape; it is left with other fields.
+        state: ``sdf``, ``hull`` and ``msdf`` on the lattice.
+        volume: trained.
+        known, unknown: pixels to fit the radiance of both templates to, and those that judge them.
+
+    Returns:
+        ``sdf``, ``hull``, ``msdf``, ``radiance`` (n, 3) and ``known`` (n,) on the lattice; None if there is
+        no hollow, none helps, or the surface would get other boundary loops.
+    """
+    lattice = subject.lattice
+    shape = (lattice.stride,) * 3
+    distance = hollows(*(state[name].reshape(shape) / lattice.spacing for name in ("hull", "msdf")),
+                       volume.opacity(), volume.seen())
+    if distance is None:
+        return None
+    before = ghost_template(subject, state)
+    after = ghost_template(subject, _carved(state, distance, lattice.spacing), like=before)
+    label, count = ndimage.label(distance > 0, np.ones((3, 3, 3)))
+    label = np.where(label, label, ndimage.maximum_filter(label, size=3))
+    ghosts = [_fitted(template, volume, known) for template in (before, after)]
+    errors = _errors_in_hollows(*ghosts, label, count, volume, unknown, lattice.spacing)
+    kept = errors[1] < _GAIN * errors[0]
+    if not kept[1:].any():
+        return None
+    if not kept[1:].all():
+        # Vertices beside a hollow belong to it.
+        owner = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+        distance = np.where(kept[label[tuple(owner)]], distance, -np.inf)
+        after = ghost_template(subject, _carved(state, distance, lattice.spacing), like=before)
+        ghosts[1] = _fitted(after, volume, known)
+    cleaned = clean_opacity(after.logits, after.vertices, after.faces, volume.config.ghost_min_area)
+    was, became = (topology(template.vertices, template.faces[(logits > 0)[template.faces].all(axis=1)])
+                   for template, logits in ((before, before.logits), (after, cleaned)))
+    if became.boundary_loops != was.boundary_loops or became.components > was.components:
+        return None
+    radiance, found = splat_to_lattice(mi.Float(ghosts[1].radiance()[0].ravel()), after.mesh, lattice)
+    return _carved(state, distance, lattice.spacing) | {
+        "msdf": msdf_from_template(cleaned, after.mesh, lattice).numpy(),
+        "radiance": radiance.numpy().reshape(-1, 3), "known": found.numpy()}
+
+
+def _carved(state: Mapping[str, np.ndarray], distance: np.ndarray, spacing: float) -> dict[str, np.ndarray]:
+    fields = {name: np.maximum(state[name], spacing * distance.ravel()).astype(np.float32)
+              for name in ("sdf", "hull")}
+    return fields | {"msdf": state["msdf"]}
+
+
+def _fitted(template: GhostTemplate, volume: RadianceVolume, pixels: PixelPool) -> RadianceGhost:
+    ghost = RadianceGhost(template.start, template.faces, volume.views, pixels, volume.config, glossy=True)
+    for _ in range(2):
+        ghost.refit(template.solid)
+    return ghost
+
+
+def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.ndarray, count: int,
+                       volume: RadianceVolume, pixels: PixelPool, spacing: float) -> np.ndarray:
+    """(2, count + 1) sums of both ghosts' image errors over rays that see into each hollow.
+
+    A hollow that no ray sees into has no errors, hence no gain.
+    """
+    labels, side = mi.UInt32(label.ravel().astype(np.uint32)), dr.opaque(mi.UInt32, len(label))
+    sums = [dr.zeros(mi.Float, count + 1) for _ in range(2)]
+    config = volume.config
+    with dr.suspend_grad():
+        for step in range(_ERROR_STEPS):
+            sample = pixels.sample(config.ghost_batch, seed=config.seed, step=step)
+            ray = volume.views.rays(sample.view, sample.film)
+            near, far = (ghost.scene.ray_intersect_preliminary(ray, coherent=False)
+                         for ghost in (before, after))
+            point = volume.to_lattice @ ray(far.t)
+            start = volume.to_lattice @ ray(near.t)
+            deeper = far.is_valid() & (dr.norm(point - start) > _DEEPER * spacing)
+            x, y, z = mi.Vector3u(dr.clip(dr.round((point + 1) / spacing), 0, mi.Float(side - 1)))
+            hollow = dr.gather(mi.UInt32, labels, x + side * (y + side * z), deeper)
+            for ghost, total in zip((before, after), sums, strict=True):
+                radiance, _ = ghost.composite(ghost.sheets(ray), ray.d)
+                error = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
+                dr.scatter_reduce(dr.ReduceOp.Add, total, error.x + error.y + error.z, hollow, deeper)
+            dr.eval(sums)
+    return np.stack([total.numpy() for total in sums])

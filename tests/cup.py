@@ -1,0 +1,69 @@
+"""A cup in a printed pattern: its hull is a solid block, as no silhouette shows its inside."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from gshell_mi.fields.solid_distance import mesh_scene
+from gshell_mi.fit.config import FitConfig
+from gshell_mi.fit.pixels import PixelPool
+from gshell_mi.targets import Target
+from gshell_mi.views import PinholeViews
+
+#: Half the side of the block, how thick the walls are, and the views' pixels per side.
+HALF, WALL, SIZE = 0.6, 0.15, 64
+
+CONFIG = FitConfig(carving_iterations=200, carving_batch=16384, ghost_batch=8192)
+
+
+def block(low, high) -> trimesh.Trimesh:
+    low, high = np.array(low, float), np.array(high, float)
+    box = trimesh.creation.box(high - low)
+    return box.apply_translation((low + high) / 2)
+
+
+def cup() -> trimesh.Trimesh:
+    """The upper half is hollow, open towards y = +HALF."""
+    inner = HALF - WALL
+    walls = [([-HALF, 0, -HALF], [-inner, HALF, HALF]), ([inner, 0, -HALF], [HALF, HALF, HALF]),
+             ([-HALF, 0, -HALF], [HALF, HALF, -inner]), ([-HALF, 0, inner], [HALF, HALF, HALF])]
+    return trimesh.util.concatenate([block([-HALF] * 3, [HALF, 0, HALF]), *(block(*ends) for ends in walls)])
+
+
+def solid_block() -> trimesh.Trimesh:
+    return block([-HALF] * 3, [HALF] * 3)
+
+
+def pattern(point: mi.Point3f) -> mi.Color3f:
+    return mi.Color3f(*(1 + dr.sin(9 * point[i] + i) * dr.sin(7 * point[(i + 1) % 3]) for i in range(3)))
+
+
+def capture(shape: trimesh.Trimesh | None = None) -> tuple[PinholeViews, PixelPool, list[Target]]:
+    """The shape (default: the cup) with ``pattern`` as its radiance, seen from all around."""
+    shape = cup() if shape is None else shape
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    look_at = mi.ScalarTransform4f().look_at
+    views = PinholeViews.from_sensors([
+        mi.load_dict({"type": "perspective", "fov": 35, "film": film,
+                      "to_world": look_at((4 * d).tolist(), [0, 0, 0], [0.1, 1, 0.2])})
+        for d in trimesh.creation.icosphere(subdivisions=1).vertices])
+    scene, targets, n = mesh_scene(shape.vertices, shape.faces), [], 4 * SIZE
+    for index in range(len(views)):
+        lane = dr.arange(mi.UInt32, n * n)
+        ray = views.rays(dr.full(mi.UInt32, index, n * n),
+                         mi.Point2f((lane % n + 0.5) / n, (lane // n + 0.5) / n))
+        hit = scene.ray_intersect_preliminary(ray, coherent=False)
+        color = dr.select(hit.is_valid(), pattern(ray(hit.t)), 0)
+        samples = np.concatenate([color.numpy(), hit.is_valid().numpy()[None]]).reshape(4, SIZE, 4, SIZE, 4)
+        rgba = np.ascontiguousarray(samples.mean(axis=(2, 4)).transpose(1, 2, 0).astype(np.float32))
+        targets.append(Target(None, rgba, True))
+    return views, PixelPool(views, targets), targets
+
+
+def hull_of(resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The block's signed distance on the lattice (z by y by x), and its surface."""
+    axis = np.linspace(-1, 1, resolution + 1)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    shape = solid_block()
+    return np.maximum.reduce([abs(x), abs(y), abs(z)]) - HALF, np.array(shape.vertices), np.array(shape.faces)
