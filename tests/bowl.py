@@ -19,7 +19,8 @@ SHORT = ("--ghost-iterations", "100", "--ghost-batch", "4096", "--ghost-smoothin
          "--no-report")
 
 #: Added to these where openings do not matter: hardly any ghost, and the template stays closed.
-CLOSED = ("--ghost-iterations", "5", "--ghost-gain", "0", "--refinement-iterations", "2")
+CLOSED = ("--ghost-iterations", "5", "--ghost-gain", "0", "--carving-iterations", "4",
+          "--refinement-iterations", "2")
 
 
 def half_sphere(segments: int = 32) -> trimesh.Trimesh:

@@ -46,7 +46,7 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], volume: RadianceVo
     shape = (lattice.stride,) * 3
     distance = hollows(*(state[name].reshape(shape) / lattice.spacing for name in ("hull", "msdf")),
                        volume.opacity(), volume.seen())
-    if distance is None:
+    if distance is None or not (_carved(state, distance, lattice.spacing)["sdf"] < 0).any():
         return None
     before = ghost_template(subject, state)
     after = ghost_template(subject, _carved(state, distance, lattice.spacing), like=before)

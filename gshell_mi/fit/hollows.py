@@ -46,7 +46,7 @@ def hollows(hull: np.ndarray, msdf: np.ndarray, opacity: np.ndarray, seen: np.nd
 
     Returns:
         (n, n, n) signed distances, in cells, positive in the hollows, -inf far from them: the carved solid's
-        are the larger of these and the hull's. None if there is nothing to carve.
+        are the larger of these and the hull's. None if there is nothing to carve, or nothing would be left.
     """
     inside = hull < 0
     lid = inside & (msdf < 0) & (hull > -_LID)
@@ -54,9 +54,9 @@ def hollows(hull: np.ndarray, msdf: np.ndarray, opacity: np.ndarray, seen: np.nd
     air = ndimage.binary_opening(~solid, ndimage.generate_binary_structure(3, 1))
     hollow = inside & air
     hollow = ndimage.binary_propagation(hollow & (hull < -_SHALLOW), mask=hollow)
-    if not hollow.any():
-        return None
     air = hollow | ~inside
+    if not hollow.any() or air.all():
+        return None
     distance = ndimage.distance_transform_edt(air) - ndimage.distance_transform_edt(~air)
     near = ndimage.binary_dilation(hollow, iterations=3)
     return np.where(near, ndimage.gaussian_filter(distance, _DISTANCE_BLUR), -np.inf)

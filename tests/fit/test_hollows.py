@@ -41,6 +41,11 @@ def test_a_solid_has_none():
     assert hollows(HULL, CLOSED, opacity, seen) is None
 
 
+def test_something_has_to_be_left():
+    opacity, seen = volume(np.zeros_like(HULL), np.ones_like(HULL, bool))
+    assert hollows(HULL, CLOSED, opacity, seen) is None
+
+
 def test_shallow_ones_are_left_alone():
     air = slot(1.5)
     opacity, seen = volume((HULL < 0) & ~air, (HULL >= 0) | air)

@@ -119,7 +119,7 @@ def test_watertight(scene, tmp_path):
     np.testing.assert_array_equal(template.vertices, found.vertices)
     assert template.metadata["_ply_raw"]["vertex"]["data"]["msdf_0"].min() > 0
     stages = {json.loads(line)["stage"] for line in (output / "log.jsonl").read_text().splitlines()}
-    assert stages == {"refinement", "joint"}
+    assert stages == {"carving", "refinement", "joint"}
 
 
 def test_watertight_closes_given_openings(scene, tmp_path):

@@ -95,7 +95,7 @@ def test_metrics(whole):
     assert metrics["psnr_training"] > 15
     assert metrics["config"]["ghost_iterations"] == 100 and metrics["config"]["seed"] == 0
     assert metrics["versions"]["mitsuba"] == mi.__version__
-    assert {"hull", "ghost", "refinement", "joint", "total"} <= set(metrics["seconds"])
+    assert {"hull", "ghost", "carving", "refinement", "joint", "total"} <= set(metrics["seconds"])
 
 
 @pytest.mark.parametrize(("gain", "kept"), [("0", False), ("1000", True)])
@@ -105,8 +105,8 @@ def test_metrics_say_whether_the_refinement_was_kept(bowl_scene, tmp_path, gain,
 
 
 def test_log_has_a_line_per_step(whole):
-    assert steps(whole) == [(stage, i) for stage, count in (("ghost", 100), ("refinement", 8), ("joint", 12))
-                            for i in range(count)]
+    counts = {"ghost": 100, "carving": 10, "refinement": 8, "joint": 12}
+    assert steps(whole) == [(stage, i) for stage, count in counts.items() for i in range(count)]
     losses = [json.loads(line)["image"] for line in (whole / "log.jsonl").read_text().splitlines()]
     assert np.mean(losses[90:100]) < 0.7 * np.mean(losses[:10]), "the ghost learns"
 
@@ -187,16 +187,16 @@ def test_interrupted_by_the_user(bowl_scene, tmp_path):
     assert "continue with --resume" in told and "Traceback" not in told
     assert not list(output.glob(".*")) and (output / "checkpoint.npz").is_file()
     assert fit(bowl_scene, output, "--resume", *options) == 0
-    assert steps(output) == [(stage, i) for stage, count in (("ghost", 30), ("refinement", 2), ("joint", 1))
-                             for i in range(count)]
+    counts = {"ghost": 30, "carving": 4, "refinement": 2, "joint": 1}
+    assert steps(output) == [(stage, i) for stage, count in counts.items() for i in range(count)]
 
 
 @pytest.mark.slow
 def test_killed_and_resumed(bowl_scene, whole, tmp_path, record_property):
     """Killed once in each stage, the fit ends as if it had not been."""
     killed = tmp_path / "killed"
-    for stage, iteration, resume in (("ghost", 30, ()), ("refinement", 3, ("--resume",)),
-                                     ("joint", 6, ("--resume",))):
+    for stage, iteration, resume in (("ghost", 30, ()), ("carving", 5, ("--resume",)),
+                                     ("refinement", 3, ("--resume",)), ("joint", 6, ("--resume",))):
         process = start(bowl_scene, killed, "--checkpoint-seconds", "0.05", *resume)
         wait_for_step(process, killed, stage, iteration)
         process.kill()
