@@ -11,8 +11,8 @@ from ..errors import UserError
 
 #: Least sensible value of a number, where that is not 0.
 _LEAST = {"resolution": 4, "start_resolution": 4, "band_resolution": 4, "triptychs": 1, "ghost_iterations": 1,
-          "ghost_batch": 1, "ghost_sheets": 1, "carving_batch": 1, "spp": 1, "primal_spp": 1, "max_depth": 2, "reparam_depth": 1,
-          "light_height": 3}
+          "ghost_batch": 1, "ghost_sheets": 1, "carving_batch": 1, "spp": 1, "primal_spp": 1,
+          "max_depth": 2, "reparam_depth": 1, "light_height": 3}
 
 #: Greatest sensible value, where there is one.
 _MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "warmup": 1, "reparam_depth": 3}
