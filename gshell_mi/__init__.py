@@ -4,6 +4,7 @@ The rooms, in the order in which data flows through them:
 
 - ``lattice``, ``sign_scan``, ``block_lattice``, ``fields``, ``extraction``: from signed distances on a
   lattice, or on its blocks around the surface, to a triangle mesh
+- ``conversion``: from a triangle mesh back to such distances
 - ``shape``: the same as a Mitsuba shape, ``{"type": "gshell"}``
 - ``integrators``: rendering with right derivatives, ``{"type": "gshell_path"}`` and ``gshell_mask``
 - ``capture``: photographs with known cameras become a fit scene, ``python -m gshell_mi.capture``
@@ -31,11 +32,12 @@ from .block_lattice import BlockLattice
 from .errors import UserError
 from .extraction import SurfaceMesh, extract
 from .fields import LatticeFields
-from .lattice import CubeLattice, FlexiCubesLattice, TetLattice, make_lattice
+from .lattice import BccLattice, CubeLattice, FlexiCubesLattice, TetLattice, make_lattice
 from .plugins import register_on_variant_change
 
 __version__ = "0.1.0"
 __all__ = [
+    "BccLattice",
     "BlockLattice",
     "CubeLattice",
     "FlexiCubesLattice",

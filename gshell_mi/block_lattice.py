@@ -111,6 +111,9 @@ class BlockLattice:
                 lattice units) to it, which is evaluated slab by slab: memory does not follow n^3.
             float_t: with a function, the Dr.Jit float type to compute with.
         """
+        if not lattice.fits_in_blocks:
+            raise UserError(f"the grid '{lattice.grid}' cannot be stored in blocks; choose another or leave "
+                            f"out the band")
         if not callable(sdf):
             sdf = dr.detach(sdf.array if dr.is_tensor_v(sdf) else sdf)
             if dr.width(sdf) != lattice.vertex_count:

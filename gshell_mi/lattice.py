@@ -9,6 +9,9 @@ import numpy as np
 
 from .errors import UserError
 
+#: Stands for a vertex that does not exist.
+MISSING = 0xFFFFFFFF
+
 #: Offset of a lattice vertex, in cells and along each axis, that ``deform = 1`` stands for.
 #:
 #: The signed volume of a Kuhn tetrahedron is linear in every single vertex coordinate, so its minimum
@@ -19,6 +22,33 @@ from .errors import UserError
 #: 0.15 the flattest tetrahedron keeps a tenth of its volume, which also keeps triangles from degenerating.
 MAX_OFFSET_CELLS = 0.15
 
+#: The same for the body-centred cubic lattice, whose tetrahedra are fatter: there the smallest volume is
+#: (1 - 4c)^2 of the whole one, again a tenth.
+MAX_OFFSET_CELLS_BCC = 0.17
+
+
+@dataclass(frozen=True)
+class CubicGrid:
+    """Vertices of a lattice in rows, columns and layers.
+
+    Vertex ``(x, y, z)`` with 0 <= x, y, z < ``stride`` has the id ``first + x + y stride + z stride^2`` and
+    lies at ``origin + spacing (x, y, z)``, in lattice units.
+    """
+
+    first: int
+    stride: int
+    origin: float
+    spacing: float
+
+    @property
+    def ids(self) -> slice:
+        """The part of a field of one value per lattice vertex that belongs to the grid."""
+        return slice(self.first, self.first + self.stride**3)
+
+    def axis(self) -> np.ndarray:
+        """The coordinates of its vertices along any axis, float64."""
+        return self.origin + self.spacing * np.arange(self.stride)
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -27,7 +57,7 @@ class Lattice:
     Vertex ``(x, y, z)`` with 0 <= x, y, z <= resolution has the id ``x + y S + z S^2``,
     ``S = resolution + 1``: a flat field reshaped in NumPy's (C) order to ``(S, S, S)`` is indexed
     ``[z, y, x]``. All lengths are in lattice units, in which the cube has the side 2. The subclasses
-    share the vertices and differ in how a surface is extracted from fields on them.
+    differ in how a surface is extracted from fields on them; only ``BccLattice`` has other vertices too.
 
     Raises:
         UserError: the resolution is not between 1 and 800.
@@ -41,6 +71,9 @@ class Lattice:
 
     grid: ClassVar[str] = ""
     """Name of the kind of lattice, the shape plugin's parameter ``grid``."""
+
+    fits_in_blocks: ClassVar[bool] = True
+    """Whether its fields can be stored in blocks, see ``BlockLattice``."""
 
     @property
     def weight_count(self) -> int:
@@ -61,8 +94,25 @@ class Lattice:
         return self.resolution + 1
 
     @property
+    def grids(self) -> tuple[CubicGrid, ...]:
+        """The cubic grids whose vertices, one grid after the other, are those of the lattice."""
+        return (CubicGrid(0, self.stride, -1.0, self.spacing),)
+
+    @property
+    def cell_vectors(self) -> np.ndarray:
+        """From a vertex to the corners 1, 2 and 4 of the cell above it, ``(3, 3)``, one per row; the others
+        are their sums."""
+        return self.spacing * np.eye(3)
+
+    def corner(self, vertex: Any, corner: Any) -> Any:
+        """The vertex at a corner (bits 0, 1, 2: steps along ``cell_vectors``) of the cell above ``vertex``,
+        which must have all its corners."""
+        stride = dr.opaque(type(vertex), self.stride)
+        return vertex + (corner & 1) + (corner >> 1 & 1) * stride + (corner >> 2) * (stride * stride)
+
+    @property
     def vertex_count(self) -> int:
-        return self.stride**3
+        return len(self.grids) * self.stride**3
 
     @property
     def spacing(self) -> float:
@@ -76,9 +126,37 @@ class Lattice:
 
     def vertex_positions(self) -> np.ndarray:
         """Positions of all vertices without offsets, ``(vertex_count, 3)`` float32 on the host."""
-        axis = np.linspace(-1.0, 1.0, self.stride, dtype=np.float32)
-        z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
-        return np.stack([x, y, z], axis=-1).reshape(-1, 3)
+        positions = []
+        for grid in self.grids:
+            z, y, x = np.meshgrid(*3 * (grid.axis().astype(np.float32),), indexing="ij")
+            positions.append(np.stack([x, y, z], axis=-1).reshape(-1, 3))
+        return np.concatenate(positions)
+
+    def on_border(self) -> np.ndarray:
+        """The vertices where the lattice ends, ``(vertex_count,)`` bool on the host: a template that is to
+        be closed has them outside."""
+        ends = np.zeros((len(self.grids), *3 * (self.stride,)), bool)
+        for axis in (1, 2, 3):
+            np.moveaxis(ends, axis, 0)[[0, -1]] = True
+        return ends.ravel()
+
+    def neighbours(self, vertex: Any) -> list[Any]:
+        """Ids of the nearest vertices of each ``vertex``, one array per direction; the vertex itself where
+        there is none."""
+        x, y, z = self.coordinates(vertex)
+        stride = dr.opaque(type(vertex), self.stride)
+        found = []
+        for coordinate, step in ((x, dr.opaque(type(vertex), 1)), (y, stride), (z, stride * stride)):
+            found.append(dr.select(coordinate > 0, vertex - step, vertex))
+            found.append(dr.select(coordinate + 1 < stride, vertex + step, vertex))
+        return found
+
+    def coordinates(self, vertex: Any) -> tuple[Any, Any, Any]:
+        """Number of each vertex in its row, column and layer."""
+        stride = dr.opaque(type(vertex), self.stride)
+        row = vertex // stride
+        z = row // stride
+        return vertex - row * stride, row - z * stride, z
 
     def points(self, float_t: type) -> Any:
         """The same positions as a Dr.Jit ``Array3f``, for fields evaluated on the device.
@@ -95,17 +173,9 @@ class Lattice:
 
     def positions_of(self, vertex: Any, float_t: type) -> Any:
         """Positions of the vertices with the ids ``vertex``, without offsets, as ``Array3f``."""
-        uint32_t = dr.uint32_array_t(float_t)
-        stride = dr.opaque(uint32_t, self.stride)
-        row = vertex // stride
-        z = row // stride
         cell = dr.opaque(float_t, self.spacing)
         array3f_t = array_type(float_t, "Array3f")
-        return array3f_t(
-            dr.fma(float_t(vertex - row * stride), cell, -1),
-            dr.fma(float_t(row - z * stride), cell, -1),
-            dr.fma(float_t(z), cell, -1),
-        )
+        return array3f_t(*(dr.fma(float_t(number), cell, -1) for number in self.coordinates(vertex)))
 
     def offset_positions(self, vertex: Any, deform: Any, float_t: type) -> Any:
         """Positions of the vertices with the ids ``vertex``, offset by ``deform`` unless that is None."""
@@ -158,7 +228,94 @@ class FlexiCubesLattice(Lattice):
         return 21 * self.resolution**3
 
 
-_KINDS: dict[str, type[Lattice]] = {kind.grid: kind for kind in (TetLattice, CubeLattice, FlexiCubesLattice)}
+@dataclass(frozen=True)
+class BccLattice(Lattice):
+    """Body-centred cubic lattice (``bcc``): marching tetrahedra nearer to isotropic than Kuhn's.
+
+    Its vertices are those of two cubic grids of ``(resolution + 1)^3`` vertices, one after the other, the
+    second shifted by half a cell along each axis: a flat field reshaped to ``(2, S, S, S)`` is indexed
+    ``[grid, z, y, x]``. The cells are a little smaller than the other lattices', so that both grids fit into
+    [-1, 1]^3. All tetrahedra are congruent: Kuhn's, squeezed along the diagonal that they share.
+
+    >>> BccLattice(4).vertex_count
+    250
+    """
+
+    grid: ClassVar[str] = "bcc"
+    fits_in_blocks: ClassVar[bool] = False
+
+    #: Half diagonals of a cell, in half cells, whose sums are the corners of Kuhn's cell squeezed.
+    BASIS: ClassVar[tuple[tuple[int, int, int], ...]] = ((-1, 1, 1), (1, -1, 1), (1, 1, -1))
+
+    @property
+    def grids(self) -> tuple[CubicGrid, ...]:
+        h, stride = self.spacing, self.stride
+        return CubicGrid(0, stride, -1.0, h), CubicGrid(stride**3, stride, -1.0 + h / 2, h)
+
+    @property
+    def spacing(self) -> float:
+        return 2.0 / (self.resolution + 0.5)
+
+    @property
+    def max_offset(self) -> float:
+        return MAX_OFFSET_CELLS_BCC * self.spacing
+
+    def neighbours(self, vertex: Any) -> list[Any]:
+        uint_t, stride = type(vertex), dr.opaque(type(vertex), self.stride)
+        second = vertex >= stride * stride * stride
+        # Along an axis the neighbours in the other grid have this one's number and the one below or above.
+        numbers = self.coordinates(vertex)
+        both = [(n - dr.select(second, uint_t(0), 1), n + dr.select(second, uint_t(1), 0)) for n in numbers]
+        offset = dr.select(second, uint_t(0), stride * stride * stride)
+        found = []
+        for corner in range(8):
+            x, y, z = (both[axis][corner >> axis & 1] for axis in range(3))
+            exists = (x < stride) & (y < stride) & (z < stride)  # -1 has wrapped around
+            found.append(dr.select(exists, offset + x + stride * (y + stride * z), vertex))
+        return found
+
+    @property
+    def cell_vectors(self) -> np.ndarray:
+        return self.spacing / 2 * np.array(self.BASIS, float)
+
+    def corner(self, vertex: Any, corner: Any) -> Any:
+        """The vertex at a corner of the squeezed cell above ``vertex``; ``MISSING`` where there is none."""
+        uint_t, stride = type(vertex), dr.opaque(type(vertex), self.stride)
+        count = stride * stride * stride
+        second = vertex >= count
+        bits = [corner >> i & 1 for i in range(3)]
+        total = bits[0] + bits[1] + bits[2]
+        changes = total & 1  # to the other grid, whose numbers are those of half a cell below or above
+        rounding = dr.select(second, changes, uint_t(0) - changes)
+        # A step along a basis vector is one of half a cell along two axes, and one back along the third.
+        x, y, z = (number + (total + 2 - 2 * bit + rounding >> 1) - 1
+                   for number, bit in zip(self.coordinates(vertex), bits, strict=True))
+        exists = (x < stride) & (y < stride) & (z < stride)  # -1 has wrapped around
+        found = x + stride * (y + stride * z) + dr.select(second ^ (changes == 1), count, 0)
+        return dr.select(exists, found, MISSING)
+
+    def corner_offset(self, corner: int, second: bool) -> int:
+        """Difference between the ids of that corner and of the vertex below, of either grid."""
+        bits = [corner >> i & 1 for i in range(3)]
+        total = sum(bits)
+        rounding = (1 if second else -1) * (total & 1)
+        steps = ((total - 2 * bit + rounding) // 2 for bit in bits)
+        offset = sum(step * self.stride**axis for axis, step in enumerate(steps))
+        return offset + (total & 1) * (-1 if second else 1) * self.stride**3
+
+    def coordinates(self, vertex: Any) -> tuple[Any, Any, Any]:
+        count = dr.opaque(type(vertex), self.stride**3)
+        return super().coordinates(vertex - dr.select(vertex >= count, count, 0))
+
+    def positions_of(self, vertex: Any, float_t: type) -> Any:
+        half = dr.opaque(float_t, self.spacing / 2)
+        second = vertex >= dr.opaque(type(vertex), self.stride**3)
+        return super().positions_of(vertex, float_t) + dr.select(second, half, 0)
+
+
+_KINDS: dict[str, type[Lattice]] = {
+    kind.grid: kind for kind in (TetLattice, CubeLattice, FlexiCubesLattice, BccLattice)
+}
 
 #: Names of the kinds of lattices.
 GRIDS: tuple[str, ...] = tuple(_KINDS)
@@ -176,6 +333,23 @@ def make_lattice(grid: str, resolution: int) -> Lattice:
     if grid not in _KINDS:
         raise UserError(f"grid '{grid}' is not available; choose one of {', '.join(GRIDS)}")
     return _KINDS[grid](resolution)
+
+
+def lattice_of(grid: str, vertex_count: int) -> Lattice:
+    """The lattice of the kind ``grid`` that has so many vertices.
+
+    Raises:
+        UserError: there is none.
+
+    >>> lattice_of("tet", 27)
+    TetLattice(resolution=2)
+    """
+    per_grid = vertex_count // len(make_lattice(grid, 1).grids)
+    resolution = round(per_grid ** (1 / 3)) - 1
+    if resolution < 1 or make_lattice(grid, resolution).vertex_count != vertex_count:
+        twice = "2 " if grid == BccLattice.grid else ""
+        raise UserError(f"{vertex_count} values are not {twice}(resolution + 1)^3, as grid '{grid}' needs")
+    return make_lattice(grid, resolution)
 
 
 def array_type(float_t: type, name: str) -> type:

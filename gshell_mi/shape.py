@@ -9,10 +9,11 @@ import numpy as np
 
 from . import compat, memory
 from .block_lattice import BlockLattice
+from .conversion import from_mesh
 from .errors import UserError
 from .extraction import SurfaceMesh, extract
 from .extraction.surface_mesh import gather
-from .fields import LatticeFields, from_mesh, sphere
+from .fields import LatticeFields, sphere
 from .fields.carried import Carried
 from .lattice import make_lattice
 from .timing import phase
@@ -31,7 +32,7 @@ class GShell(mi.Mesh):
 
     ======================  =================================================================
     ``resolution``          integer: cells per side of the lattice (default: that of the file, or 64)
-    ``grid``                string: ``tet`` (default), ``cube`` or ``flexicubes``, see ``lattice``
+    ``grid``                string: ``tet`` (default), ``cube``, ``flexicubes`` or ``bcc``, see ``lattice``
     ``to_world``            transform: maps the lattice's cube [-1, 1]^3 to the world
     ``filename``            string: initial fields: an .npz with ``sdf`` and, if wanted, ``msdf`` and
                             ``deform``, or a mesh file in world space (default: a sphere of radius 0.5

@@ -6,16 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from .lattice import Lattice
+from .lattice import MISSING, BccLattice, Lattice
 
 if TYPE_CHECKING:
     from .block_lattice import BlockLattice
 
 #: Values below this are negative. Not 0: some threads flush denormal numbers to 0 and others do not.
 NEGATIVE = -(2.0**-126)
-
-#: Stands for a vertex that is not stored.
-MISSING = 0xFFFFFFFF
 
 
 def corner_offset(corner: Any, stride: Any) -> Any:
@@ -86,17 +83,35 @@ def sign_changes(inside: Any, lattice: Lattice) -> Any:
     uint_t = type(inside)
     word = dr.arange(uint_t, dr.width(inside))
     stride = dr.opaque(uint_t, lattice.stride)
-    count = lattice.vertex_count
-    last_vertex, last_word = dr.opaque(uint_t, count - 1), dr.opaque(uint_t, (count - 1) // 32)
     active = dr.zeros(uint_t)
-    for corner in range(1, 8):
-        offset = corner_offset(uint_t(corner), stride)
-        low, shift = word + (offset >> 5), offset & 31
-        first = dr.gather(uint_t, inside, dr.minimum(low, last_word))
-        second = dr.gather(uint_t, inside, dr.minimum(low + 1, last_word))
-        active |= (first >> shift | second << (31 - shift) << 1) ^ inside
-    beyond = ~dr.opaque(uint_t, 0) << (last_vertex & 31) << 1  # bits past the last vertex
-    return _set_bits(active & ~dr.select(word == last_word, beyond, 0))
+    if isinstance(lattice, BccLattice):
+        in_second = ~_bits_before(word, lattice.stride**3)
+        for corner in range(1, 8):
+            first, second = (_shifted(inside, word, dr.opaque(uint_t, offset >> 5 & MISSING),
+                                      dr.opaque(uint_t, offset & 31))
+                             for offset in (lattice.corner_offset(corner, grid) for grid in (False, True)))
+            active |= (first & ~in_second | second & in_second) ^ inside
+    else:
+        for corner in range(1, 8):
+            offset = corner_offset(uint_t(corner), stride)
+            active |= _shifted(inside, word, offset >> 5, offset & 31) ^ inside
+    return _set_bits(active & _bits_before(word, lattice.vertex_count))
+
+
+def _shifted(inside: Any, word: Any, words: Any, bits: Any) -> Any:
+    """The signs that lie ``words`` and ``bits`` after those of each word; arbitrary where there are none."""
+    last = dr.opaque(type(word), dr.width(inside) - 1)
+    low = dr.gather(type(word), inside, dr.minimum(word + words, last))
+    high = dr.gather(type(word), inside, dr.minimum(word + words + 1, last))
+    return low >> bits | high << (31 - bits) << 1
+
+
+def _bits_before(word: Any, vertex: int) -> Any:
+    """Per word the bits of the vertices before ``vertex``."""
+    uint_t = type(word)
+    whole, rest = dr.opaque(uint_t, vertex // 32), dr.opaque(uint_t, vertex % 32)
+    part = (dr.opaque(uint_t, 1) << rest) - 1
+    return dr.select(word < whole, MISSING, dr.select(word == whole, part, 0))
 
 
 def _sign_changes_in_blocks(inside: Any, blocks: BlockLattice) -> Any:

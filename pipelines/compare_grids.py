@@ -7,9 +7,6 @@ sphere (in thousandths of the radius), the mean angle between face normals and t
 that angle depends on the direction of the surface (worst over best of 26 directions), the 5th percentile of
 the triangles' smallest angle, and the time of an extraction with one thread. Averages are over spheres with
 random centres.
-
-``bcc`` is the body-centred cubic lattice. Its tetrahedra are the Kuhn tetrahedra of a cubic lattice that is
-squeezed along the diagonal they share, so it is measured on a rhombohedron; its time is that of filling one.
 """
 
 import argparse
@@ -20,27 +17,14 @@ import drjit.llvm.ad as llvm
 import numpy as np
 
 from gshell_mi.extraction import extract
-from gshell_mi.lattice import GRIDS, TetLattice, make_lattice
+from gshell_mi.lattice import GRIDS, make_lattice
 
 _RADIUS = 0.7
 
 
-class _BodyCentredLattice(TetLattice):
-    """Body-centred cubic lattice on the rhombohedron whose inscribed ball has the radius 1.1."""
-
-    def positions_of(self, vertex, float_t):
-        x, y, z = super().positions_of(vertex, float_t)
-        scale = 1.1 / 2**0.5
-        return llvm.Array3f(scale * (y + z - x), scale * (z + x - y), scale * (x + y - z))
-
-
-def _lattice(grid: str, resolution: int):
-    return _BodyCentredLattice(resolution) if grid == "bcc" else make_lattice(grid, resolution)
-
-
 def measure(grid: str, resolution: int, repeats: int) -> dict[str, float]:
     """Figures of one kind of lattice, averaged over ``repeats`` spheres."""
-    lattice, rng = _lattice(grid, resolution), np.random.default_rng(0)
+    lattice, rng = make_lattice(grid, resolution), np.random.default_rng(0)
     directions = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     vertices, distances, smallest, seconds = [], [], [], np.inf
@@ -84,7 +68,7 @@ def main() -> None:
     print("| grid | cells per side | vertices | distance (1e-3) | normals (degrees) | worst / best direction "
           "| smallest angle (degrees) | ms |")
     print("|---|---|---|---|---|---|---|---|")
-    for grid in (*GRIDS, "bcc"):
+    for grid in GRIDS:
         trial = measure(grid, 32, arguments.repeats)["vertices"]
         resolution = round(32 * (arguments.vertices / trial) ** 0.5)
         found = measure(grid, resolution, arguments.repeats)

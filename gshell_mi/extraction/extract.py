@@ -6,7 +6,8 @@ import drjit as dr
 
 from ..block_lattice import BlockLattice
 from ..errors import UserError
-from ..lattice import CubeLattice, FlexiCubesLattice, Lattice, TetLattice
+from ..lattice import BccLattice, CubeLattice, FlexiCubesLattice, Lattice, TetLattice
+from .bcc import BccExtraction
 from .cubes import CubeExtraction
 from .flexicubes import FlexiCubesExtraction
 from .grid_extraction import GridExtraction
@@ -17,6 +18,7 @@ _ALGORITHMS: dict[str, type[GridExtraction]] = {
     TetLattice.grid: TetExtraction,
     CubeLattice.grid: CubeExtraction,
     FlexiCubesLattice.grid: FlexiCubesExtraction,
+    BccLattice.grid: BccExtraction,
 }
 
 

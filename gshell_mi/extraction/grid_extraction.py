@@ -43,7 +43,8 @@ class ActiveCells:
     crossed: Any
     """Bit d: the edge from the lowest corner to corner d is crossed."""
     border: Any
-    """Bit i: the cell reaches beyond the lattice along axis i, so that it is no cell."""
+    """Bit i: the cell reaches beyond the lattice along axis i, so that it is no cell. In a body-centred cubic
+    lattice, bit c: its corner c does not exist."""
 
 
 class GridExtraction(ABC):

@@ -45,10 +45,7 @@ class TetExtraction(MarchingExtraction):
     EDGE_DIFFERENCES = 0b11111110
 
     def polygons(self, cells: ActiveCells, record: Any) -> _Polygons:
-        active = dr.gather(
-            self.uint_t, self.uint_t(tables.active_tets_table()), cells.signs, cells.border == 0
-        )
-        owner, tet = expand(active, 3)
+        owner, tet = expand(self.active_tets(cells), 3)
         base = dr.gather(self.uint_t, cells.cell, owner)
         key = tet * 256 + dr.gather(self.uint_t, cells.signs, owner)
         packed = dr.gather(self.uint_t, self.uint_t(tables.polygon_table()), key)
@@ -62,6 +59,11 @@ class TetExtraction(MarchingExtraction):
         polygons = _Polygons(base, key, quad, corners)
         dr.eval(base, key, quad, corners)
         return polygons
+
+    def active_tets(self, cells: ActiveCells) -> Any:
+        """Per cell, bit i: the surface passes through its tetrahedron i."""
+        table = self.uint_t(tables.active_tets_table())
+        return dr.gather(self.uint_t, table, cells.signs, cells.border == 0)
 
     def triangulate(self, polygons: _Polygons, slots: Any = None) -> Any:
         """Triangles of whole polygons; a quad is split from its first to its third vertex.

@@ -7,11 +7,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from scipy import ndimage
 
 from ..block_lattice import BlockLattice
 from ..errors import UserError
-from ..lattice import Lattice, make_lattice
+from ..lattice import Lattice, lattice_of, make_lattice
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class LatticeFields:
     @cached_property
     def lattice(self) -> Lattice | BlockLattice:
         if self.blocks is None:
-            return make_lattice(self.grid, round(self.sdf.size ** (1 / 3)) - 1)
+            return lattice_of(self.grid, self.sdf.size)
         import mitsuba as mi  # blocks live on the device, of whichever variant is set
 
         def sdf(blocks: BlockLattice) -> mi.Float:
@@ -61,7 +60,7 @@ class LatticeFields:
         return BlockLattice(make_lattice(self.grid, self.block_resolution), mi.UInt32(self.blocks), sdf)
 
     def to_lattice(self, resolution: int) -> LatticeFields:
-        """The fields on a lattice of another resolution, interpolated trilinearly; neutral weights.
+        """The fields interpolated on a lattice of another resolution; neutral weights. Needs a variant.
 
         Offsets are kept as lengths: they double in units of ``deform`` when the cells halve, and are
         clipped to what the new lattice allows.
@@ -73,15 +72,16 @@ class LatticeFields:
             raise UserError("fields in blocks are known near their surface only and cannot be resampled; "
                             "from_mesh makes fields of any resolution from the extracted mesh")
         old, new = self.lattice, make_lattice(self.grid, resolution)
+        if new == old:
+            return LatticeFields(self.sdf, self.msdf, self.deform, self.grid)
+        import mitsuba as mi
 
-        def zoom(values: np.ndarray) -> np.ndarray:
-            volume = values.reshape((old.stride,) * 3)
-            return ndimage.zoom(volume, new.stride / old.stride, order=1, mode="nearest").ravel()
+        from .interpolation import Interpolation
 
-        scale = old.max_offset / new.max_offset
-        deform = np.stack([zoom(self.deform[axis::3]) for axis in range(3)], axis=-1) * scale
-        clipped = np.clip(deform, -1, 1).astype(np.float32)
-        return LatticeFields(zoom(self.sdf), zoom(self.msdf), clipped.ravel(), self.grid)
+        points = new.points(mi.Float)
+        sdf, msdf, deform = (Interpolation(mi.Float(field), old)(points).numpy()
+                             for field in (self.sdf, self.msdf, self.deform))
+        return LatticeFields(sdf, msdf, np.clip(deform * (old.max_offset / new.max_offset), -1, 1), self.grid)
 
     def in_blocks(self, resolution: int | None = None) -> LatticeFields:
         """The fields in blocks around their surface, of this lattice or, interpolated, of a finer one.
@@ -134,11 +134,13 @@ class LatticeFields:
         if "sdf" not in arrays:
             raise UserError(f"{path}: holds no array 'sdf' (it has {', '.join(arrays) or 'none'})")
         sdf, blocks = arrays["sdf"], None
-        stride = round(sdf.size ** (1 / 3))
         if "blocks" in arrays:
             blocks = arrays["blocks"].astype(np.uint32)
-        elif stride**3 != sdf.size or stride < 2:
-            raise UserError(f"{path}: sdf has {sdf.size} values, which is not (resolution + 1)^3")
+        else:
+            try:
+                lattice_of(grid, sdf.size)
+            except UserError as error:
+                raise UserError(f"{path}: sdf does not fit: {error}") from None
         closed = cls.closed(sdf, grid)
         fields = cls(sdf, arrays.get("msdf", closed.msdf), arrays.get("deform", closed.deform), grid,
                      blocks=blocks, block_resolution=int(arrays.get("block_resolution", [0])[0]))
@@ -154,9 +156,5 @@ class LatticeFields:
 
 def closed_at_border(sdf: np.ndarray, lattice: Lattice) -> np.ndarray:
     """A signed distance field made finite, and outside at the cube's faces: its template is watertight."""
-    n = lattice.stride
-    grid = np.clip(sdf, -1.0, 1.0).reshape(n, n, n).astype(np.float32)
-    for axis in range(3):
-        ends = np.moveaxis(grid, axis, 0)
-        ends[[0, -1]] = np.maximum(ends[[0, -1]], 0.5 * lattice.spacing)
-    return grid.ravel()
+    sdf, outside = np.clip(sdf, -1.0, 1.0).astype(np.float32), np.float32(0.5 * lattice.spacing)
+    return np.where(lattice.on_border(), np.maximum(sdf, outside), sdf)

@@ -25,7 +25,10 @@ def falling(start: float, end: float, progress: float) -> float:
 
 
 class LatticeDiffusion:
-    """Approximates ``(I + smoothing L)^-1`` with the lattice's 6-neighbour Laplacian L.
+    """Approximates ``(I + smoothing L)^-1`` with the Laplacian L of the lattice's nearest neighbours.
+
+    These are six in a cubic grid and eight in a body-centred one; either L is about ``-cell^2`` times that of
+    space.
 
     Damped Jacobi iterations: they reach no farther than ``iterations`` cells, which is all that a
     preconditioner needs, and each is one small kernel. There is no flow through the boundary, so a
@@ -41,10 +44,13 @@ class LatticeDiffusion:
         self.iterations = iterations
         self._lattice = lattice
         self._count = lattice.vertex_count
-        self._neighbours = None if isinstance(lattice, BlockLattice) else _neighbours(lattice)
+        self._neighbours = None
+        if not isinstance(lattice, BlockLattice):
+            self._neighbours = lattice.neighbours(dr.arange(mi.UInt32, self._count))
+            dr.eval(self._neighbours)
 
     def _around(self) -> list[mi.UInt32]:
-        """The six neighbours of each vertex; a missing one is the vertex itself."""
+        """The neighbours of each vertex; a missing one is the vertex itself."""
         if self._neighbours:
             return self._neighbours
         # Found anew each time: the tables of rows are small, the neighbours of all vertices are not.
@@ -67,8 +73,9 @@ class LatticeDiffusion:
         known, weight = dr.unravel(kind, field), dr.opaque(mi.Float, smoothing)
         solution = field
         for _ in range(self.iterations):
-            total = sum(dr.gather(kind, solution, neighbour) for neighbour in self._around())
-            solution = dr.ravel((known + weight * total) / (1 + 6 * weight))
+            neighbours = self._around()
+            total = sum(dr.gather(kind, solution, neighbour) for neighbour in neighbours)
+            solution = dr.ravel((known + weight * total) / (1 + len(neighbours) * weight))
             dr.eval(solution)
         return solution
 
@@ -93,20 +100,6 @@ class LatticeDiffusion:
         total = dr.select(original_here, values, self(values, smoothing))
         known = original | reached
         return dr.select(original_here | reached_here, total / divisor, 0), known
-
-
-def _neighbours(lattice: Lattice) -> list[mi.UInt32]:
-    index = dr.arange(mi.UInt32, lattice.vertex_count)
-    n = dr.opaque(mi.UInt32, lattice.stride)
-    row = index // n
-    z = row // n
-    x, y = index - row * n, row - z * n
-    neighbours = []
-    for coordinate, step in ((x, dr.opaque(mi.UInt32, 1)), (y, n), (z, n * n)):
-        neighbours.append(dr.select(coordinate > 0, index - step, index))
-        neighbours.append(dr.select(coordinate + 1 < n, index + step, index))
-    dr.eval(neighbours)
-    return neighbours
 
 
 class MeshDiffusion:

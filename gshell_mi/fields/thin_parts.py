@@ -33,29 +33,26 @@ def thin_part_refinement(resolution: int) -> int:
     return max(min(_REFINEMENT, _MOST_CELLS // resolution), 1)
 
 
-def thickened_field(sdf: np.ndarray, refinement: int) -> tuple[np.ndarray, np.ndarray]:
-    """Samples a signed distance field for a lattice that its thin parts would slip through.
+def thickened(sdf: np.ndarray, refinement: int) -> np.ndarray:
+    """Grows the parts of a solid that a lattice would slip through.
 
     Args:
-        sdf: (refinement n + 1,)*3 signed distances, in units of the coarse cells.
-        refinement: fine cells per coarse cell.
+        sdf: (n, n, n) signed distances, in cells of the lattice, sampled on a finer grid.
+        refinement: samples per cell along each axis.
 
     Returns:
-        Two (n + 1,)*3 fields at the coarse lattice's vertices, in the same units: the distances with the
-        thin parts grown, and those of the solid itself.
+        The distances to the grown solid, likewise; ``sdf`` itself if nothing is thin.
     """
-    coarse = sdf[::refinement, ::refinement, ::refinement]
     thin, core = sdf < 0, sdf < -_RADIUS
     if core.any():
         thin &= ndimage.distance_transform_edt(~core) > 2 * _RADIUS * refinement
     if not thin.any():
-        return coarse, coarse
+        return sdf
     around = 2 * refinement + 1
     half = ndimage.maximum_filter(np.where(thin, -sdf, 0), size=around)
     growth = np.where(thin, np.clip(_HALF - half, 0, None), 0)
     # The lattice vertices that will hold the part lie beside it.
-    growth = ndimage.gaussian_filter(ndimage.maximum_filter(growth, size=around), 0.5 * refinement)
-    return coarse - growth[::refinement, ::refinement, ::refinement], coarse
+    return sdf - ndimage.gaussian_filter(ndimage.maximum_filter(growth, size=around), 0.5 * refinement)
 
 
 def back_on_solid(vertices: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> np.ndarray:

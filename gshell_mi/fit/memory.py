@@ -8,6 +8,7 @@ import numpy as np
 
 from .. import memory
 from ..fields.thin_parts import thin_part_refinement
+from ..lattice import make_lattice
 from .config import FitConfig
 
 # Bytes, measured on llvm_ad_rgb: peak resident memory of short fits (all stages, a few steps each) with 32 to
@@ -42,13 +43,14 @@ class MemoryEstimate:
 
     @classmethod
     def of(cls, config: FitConfig, resolution: int, sizes: np.ndarray, *,
-           report: bool = True) -> MemoryEstimate:
+           grid: str = "tet", report: bool = True) -> MemoryEstimate:
         """Estimates it.
 
         Args:
             config: the settings.
             resolution: cells per side of the lattice.
             sizes: (N, 2) width and height of the views in pixels.
+            grid: the kind of lattice.
             report: whether mesh.glb and report.html are written.
 
         >>> few, many = (MemoryEstimate.of(FitConfig(), 64, np.full((n, 2), 256)) for n in (24, 48))
@@ -57,15 +59,16 @@ class MemoryEstimate:
         """
         # Fields in blocks follow the surface.
         whole = resolution
-        if resolution >= config.band_resolution:
+        if resolution >= config.band_resolution and make_lattice(grid, 1).fits_in_blocks:
             whole = min(resolution, config.start_resolution)
+        vertices = make_lattice(grid, whole).vertex_count
         pixels = np.asarray(sizes, np.int64).prod(axis=1)
         votes = config.hull_daylight_votes * len(pixels)
         hull_samples = (thin_part_refinement(whole) * whole + 1) ** 3
         return cls(
             program=_PROGRAM + (_ASSET if report else 0),
             hull=int((_PER_HULL_SAMPLE + _PER_VOTE * votes) * hull_samples),
-            lattice=_PER_VERTEX * (whole + 1) ** 3 + _PER_SQUARE_CELL * resolution**2,
+            lattice=_PER_VERTEX * vertices + _PER_SQUARE_CELL * resolution**2,
             targets=_PER_PIXEL * int(pixels.sum()),
             samples=_PER_SAMPLE * int(pixels.max()) * max(config.primal_spp, config.spp))
 

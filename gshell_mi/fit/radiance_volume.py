@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from .. import losses
-from ..fields.solid_distance import mesh_scene
+from ..conversion.solid_distance import mesh_scene
 from ..views import PinholeViews
 from .config import FitConfig
 from .observer import Preview

@@ -14,9 +14,9 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from ..conversion.solid_distance import mesh_scene, solid_distance
 from ..fields import LatticeFields
 from ..fields.smoothing import MeshDiffusion
-from ..fields.solid_distance import mesh_scene, solid_distance
 from ..topology import Topology, topology
 from .opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
 

@@ -19,11 +19,12 @@ from ..export import check_output_folder, export_fit, make_output_folder, write_
 from ..export.asset import write_asset
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
+from ..fields.interpolation import Interpolation
 from ..fields.lattice_fields import closed_at_border
-from ..fields.thin_parts import thickened_field, thin_part_refinement
+from ..fields.thin_parts import thickened, thin_part_refinement
 from ..fields.visual_hull import visual_hull
 from ..files import replacing
-from ..lattice import make_lattice
+from ..lattice import CubeLattice, make_lattice
 from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
 from ..scene import load_fit_scene
@@ -164,7 +165,8 @@ class _Fit:
         """Says how much memory the fit needs, and refuses it if that much is not free."""
         sizes = np.array([sensor.film().crop_size() for sensor in sensors])
         resolution = self.config.resolution or subject.lattice.resolution
-        self.memory = MemoryEstimate.of(self.config, resolution, sizes, report=self.report)
+        self.memory = MemoryEstimate.of(self.config, resolution, sizes, grid=subject.lattice.grid,
+                                        report=self.report)
         free = free_memory_of_variant()
         told = "" if free is None else f"; {free / GIB:.1f} GiB are free"
         self.progress.tell(f"memory: about {self.memory.total / GIB:.1f} GiB{told}")
@@ -179,14 +181,17 @@ class _Fit:
         with self.progress.stage("visual hull", len(self.views)) as advance, self._timed("hull"):
             to_world = mi.Transform4f(self.scene.subject.to_world)
             finer = thin_part_refinement(self.lattice.resolution)
-            lattice = make_lattice(self.lattice.grid, finer * self.lattice.resolution)
-            points = to_world @ mi.Point3f(lattice.points(mi.Float))
+            samples = CubeLattice(finer * self.lattice.resolution)
+            points = to_world @ mi.Point3f(samples.points(mi.Float))
             world = visual_hull(points, self.views, [target.rgba[..., 3] for target in self.scene.targets],
                                 daylight_votes=self.config.hull_daylight_votes, progress=advance)
             cell = self.lattice.spacing
-            fine = np.clip(world.numpy() / length_scale(self.scene.subject.to_world), -1, 1) / cell
-            grown, hull = thickened_field(fine.reshape((lattice.stride,) * 3), finer)
-            sdf, hull = (closed_at_border(cell * field, self.lattice) for field in (grown, hull))
+            solid = np.clip(world.numpy() / length_scale(self.scene.subject.to_world), -1, 1) / cell
+            grown = thickened(solid.reshape((samples.stride,) * 3), finer)
+            vertices = self.lattice.points(mi.Float)
+            sdf, hull = (Interpolation(mi.Float(cell * field.ravel()), samples)(vertices).numpy()
+                         for field in (grown, solid))
+            sdf, hull = (closed_at_border(field, self.lattice) for field in (sdf, hull))
         if not (sdf < 0).any():
             raise UserError(
                 f"The masks of the targets have no common volume in the box of '{self.scene.path}'; check "

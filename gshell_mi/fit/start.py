@@ -11,7 +11,7 @@ from ..block_lattice import BlockLattice
 from ..errors import UserError
 from ..fields import LatticeFields
 from ..fields.interpolation import Interpolation
-from ..lattice import Lattice, make_lattice
+from ..lattice import Lattice, lattice_of
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, given_material
 from ..scene import FitScene
@@ -49,7 +49,7 @@ def start_fields(arrays: Mapping[str, np.ndarray], lattice: Lattice, config: Fit
         return LatticeFields(**stored, grid=lattice.grid, block_resolution=lattice.resolution)
     deform = arrays.get("deform", np.zeros(3 * arrays["sdf"].size, np.float32))
     fields = LatticeFields(arrays["sdf"], arrays["msdf"], deform, grid=lattice.grid)
-    if lattice.resolution >= config.band_resolution:
+    if lattice.resolution >= config.band_resolution and lattice.fits_in_blocks:
         return fields.in_blocks(lattice.resolution)
     return fields if fields.lattice == lattice else fields.to_lattice(lattice.resolution)
 
@@ -68,7 +68,7 @@ def start_material(scene: FitScene, arrays: Mapping[str, np.ndarray], lattice: L
     if config.material_is_given:
         return GivenMaterial(lattice.vertex_count, **given)
     radiance, known = arrays["radiance"], arrays["known"]
-    seen_on = make_lattice(lattice.grid, round(len(known) ** (1 / 3)) - 1)
+    seen_on = lattice_of(lattice.grid, len(known))
     if seen_on != lattice:
         points = lattice.points(mi.Float)
         share = Interpolation(mi.Float(known.astype(np.float32)), seen_on)(points).numpy()

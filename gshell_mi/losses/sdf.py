@@ -64,12 +64,9 @@ def _axis_edges(sdf: mi.Float, lattice: Lattice | BlockLattice):
             exists = (neighbour != MISSING) & lattice.in_lattice(vertex)
             yield sdf, gather(mi.Float, sdf, dr.select(exists, neighbour, vertex)), exists
         return
-    stride = dr.opaque(mi.UInt32, lattice.stride)
-    vertex = dr.arange(mi.UInt32, lattice.vertex_count)
-    row = vertex // stride
-    plane = row // stride
-    for coordinate, step in ((vertex - row * stride, dr.opaque(mi.UInt32, 1)), (row - plane * stride, stride),
-                             (plane, stride * stride)):
+    vertex, stride = dr.arange(mi.UInt32, lattice.vertex_count), dr.opaque(mi.UInt32, lattice.stride)
+    steps = (dr.opaque(mi.UInt32, 1), stride, stride * stride)
+    for coordinate, step in zip(lattice.coordinates(vertex), steps, strict=True):
         exists = coordinate + 1 < stride
         yield sdf, gather(mi.Float, sdf, dr.select(exists, vertex + step, vertex)), exists
 

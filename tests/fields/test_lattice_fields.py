@@ -45,7 +45,7 @@ def test_sdf_alone_is_closed(tmp_path):
     ("arrays", "message"),
     [
         ({"msdf": np.ones(8)}, r"holds no array 'sdf' \(it has msdf\)"),
-        ({"sdf": np.ones(9)}, r"sdf has 9 values, which is not \(resolution \+ 1\)\^3"),
+        ({"sdf": np.ones(9)}, r"sdf does not fit: 9 values are not \(resolution \+ 1\)\^3"),
         ({"sdf": np.ones(8), "msdf": np.ones(7)}, "msdf has 7 values, but sdf needs 8"),
         ({"sdf": np.ones(8), "deform": np.ones(8)}, "deform has 8 values, but sdf needs 24"),
     ],

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gshell_mi.fields.mesh_distance import MeshFeet, nearest_faces
+from gshell_mi.conversion.mesh_distance import MeshFeet, nearest_faces
 from gshell_mi.lattice import TetLattice
 
 

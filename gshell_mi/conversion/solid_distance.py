@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 from scipy import ndimage
 
+from ..fields.lattice_fields import closed_at_border
 from ..lattice import Lattice
-from .lattice_fields import closed_at_border
 from .mesh_distance import MeshFeet, nearest_faces
 
 #: Distances are exact up to this many cells from the template.
@@ -39,20 +39,22 @@ def solid_distance(vertices: np.ndarray, faces: np.ndarray, solid: np.ndarray,
     points = np.array(lattice.points(mi.Float)).T
     band, face = nearest_faces(mesh, lattice, _BAND * lattice.spacing)
     distance = MeshFeet(mesh)(points[band], face[:, None]).distance
-    grid = np.full(lattice.vertex_count, np.nan)
-    grid[band] = np.where(_inside(vertices, faces, points[band]), -distance, distance)
+    field = np.full(lattice.vertex_count, np.nan)
+    field[band] = np.where(_inside(vertices, faces, points[band]), -distance, distance)
 
     sheet = trimesh.Trimesh(vertices, faces[solid[faces].all(axis=1)], process=False)
     if len(sheet.faces):
         near, face = nearest_faces(sheet, lattice, _SOLID_BAND * lattice.spacing)
         feet = MeshFeet(sheet)(points[near], face[:, None])
-        under = (grid[near] < 0) & (feet.height < 0) & ~feet.on_rim
-        grid[near[under]] = -feet.distance[under]
+        under = (field[near] < 0) & (feet.height < 0) & ~feet.on_rim
+        field[near[under]] = -feet.distance[under]
 
-    grid = grid.reshape((lattice.stride,) * 3)
-    away, nearest = ndimage.distance_transform_edt(np.isnan(grid), return_indices=True)
-    grid = grid[tuple(nearest)]
-    return closed_at_border(grid + np.sign(grid) * away * lattice.spacing, lattice)
+    for grid in lattice.grids:
+        part = field[grid.ids].reshape((grid.stride,) * 3)
+        away, nearest = ndimage.distance_transform_edt(np.isnan(part), return_indices=True)
+        part = part[tuple(nearest)]
+        field[grid.ids] = (part + np.sign(part) * away * grid.spacing).ravel()
+    return closed_at_border(field, lattice)
 
 
 def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> mi.Scene:

@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 from .. import compat
 from ..errors import UserError
 from ..extraction import SurfaceMesh, extract
-from ..lattice import Lattice
+from ..fields import LatticeFields
+from ..lattice import CubicGrid, Lattice
 from ..topology import vertex_components
-from .lattice_fields import LatticeFields
 from .mesh_distance import Feet, MeshFeet, nearest_faces
 
 _BAND_CELLS = 3.0  # distances are exact and signs those of the nearest face this near the mesh
@@ -73,7 +73,8 @@ def from_mesh(
     feet = feet_of(points[band], face[:, None])
 
     far = _far_distance(lattice, points, band, feet)
-    sdf = np.where(_winding_number(lattice, mesh) > 0.5, -far, far)
+    winding = np.concatenate([_winding_number(grid, mesh) for grid in lattice.grids])
+    sdf = np.where(winding > 0.5, -far, far)
     near = np.where(feet.height < 0, -feet.distance, feet.distance)
     near[feet.on_rim] = np.copysign(feet.distance, sdf[band])[feet.on_rim]
     beside_rim = feet.on_rim & (feet.distance < _RIM_CELLS * h)
@@ -81,7 +82,7 @@ def from_mesh(
     sdf[band] = near
     if not mesh.is_watertight:
         _separate_layers(sdf, mesh, lattice, band)
-    border = np.abs(points).max(axis=1) > 1 - h / 2
+    border = lattice.on_border()
     sdf[border] = np.maximum(np.abs(sdf), h / 2)[border]  # the template closes inside the lattice
 
     fields = LatticeFields.closed(sdf, lattice.grid)
@@ -117,10 +118,12 @@ def _far_distance(lattice: Lattice, points: np.ndarray, band: np.ndarray, feet: 
     away = np.ones(lattice.vertex_count, bool)
     away[band[beside]] = False
     shape = (lattice.stride,) * 3
-    index = ndimage.distance_transform_edt(away.reshape(shape), return_distances=False, return_indices=True)
     foot = np.zeros((lattice.vertex_count, 3))
     foot[band] = feet.point
-    return np.linalg.norm(points - foot[np.ravel_multi_index(tuple(index), shape).ravel()], axis=1)
+    nearest = [grid.first + np.ravel_multi_index(tuple(ndimage.distance_transform_edt(
+        away[grid.ids].reshape(shape), return_distances=False, return_indices=True)), shape).ravel()
+        for grid in lattice.grids]
+    return np.linalg.norm(points - foot[np.concatenate(nearest)], axis=1)
 
 
 def _separate_layers(sdf: np.ndarray, mesh: trimesh.Trimesh, lattice: Lattice, band: np.ndarray) -> None:
@@ -136,15 +139,15 @@ def _separate_layers(sdf: np.ndarray, mesh: trimesh.Trimesh, lattice: Lattice, b
     inner = band[(np.abs(lattice.vertex_positions()[band]) < 1 - 1.5 * lattice.spacing).all(axis=1)]
     spacing = lattice.spacing
     flips = []
-    for difference in range(1, 8):
-        step = np.array([difference & 1, difference >> 1 & 1, difference >> 2 & 1])
-        other = inner + step @ [1, lattice.stride, lattice.stride**2]
+    for corner in range(1, 8):
+        step = [corner & 1, corner >> 1 & 1, corner >> 2] @ lattice.cell_vectors
+        other = lattice.corner(mi.UInt32(inner.astype(np.uint32)), mi.UInt32(corner)).numpy().astype(int)
         alike = (sdf[inner] < 0) == (sdf[other] < 0)
         a, b = inner[alike], other[alike]
         hits = []
         for start, way in ((a, 1), (b, -1)):
             origin = lattice.positions_of(mi.UInt32(start.astype(np.uint32)), mi.Float)
-            ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(*(way * step * spacing).tolist()))
+            ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(*(way * step).tolist()))
             ray.maxt = mi.Float(1)
             hits.append(scene.ray_intersect_preliminary(ray).t.numpy())
         twice = np.isfinite(hits[0]) & np.isfinite(hits[1]) & (hits[0] < 1 - hits[1] - 1e-3)
@@ -233,12 +236,13 @@ def _rim_distance(
     h = lattice.spacing
     vertices = template.to_numpy()[0]
     normals = np.array(dr.detach(template.vertex_normals())).T
-    low = np.clip(np.floor((vertices + 1) / h).astype(int), 0, lattice.resolution - 1)
-    corners = low @ [1, lattice.stride, lattice.stride**2]
-    corners = corners[:, None] + np.array(
-        [x + lattice.stride * (y + lattice.stride * z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]
-    )
-    candidates = nearest[corners]
+    strides = np.array([1, lattice.stride, lattice.stride**2])
+    cube = np.array(list(np.ndindex(2, 2, 2))) @ strides
+    corners = []
+    for grid in lattice.grids:
+        low = np.clip(np.floor((vertices - grid.origin) / h).astype(int), 0, grid.stride - 2)
+        corners.append(grid.first + (low @ strides)[:, None] + cube)
+    candidates = nearest[np.concatenate(corners, axis=1)]
     known = (candidates >= 0).any(axis=1)
     candidates = np.where(candidates >= 0, candidates, candidates.max(axis=1, keepdims=True))
     feet = feet_of(vertices[known].astype(float), candidates[known])
@@ -264,17 +268,17 @@ def _patches(positive: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return vertex_components(edges[alike], len(positive))[1]
 
 
-def _winding_number(lattice: Lattice, mesh: trimesh.Trimesh) -> np.ndarray:
-    """The generalised winding number w at the lattice vertices, blurred by about a cell.
+def _winding_number(grid: CubicGrid, mesh: trimesh.Trimesh) -> np.ndarray:
+    """The generalised winding number w at the vertices of a grid, blurred by about a cell.
 
     It is harmonic but for its jump across the mesh: laplace(w) = -div(n delta)
-    (Barill et al. 2018, sec. 2), solved on the lattice with w = 0 on its border, as by Kazhdan et al. (2006).
+    (Barill et al. 2018, sec. 2), solved on the grid with w = 0 on its border, as by Kazhdan et al. (2006).
     """
-    n, h = lattice.stride, lattice.spacing
+    n, h = grid.stride, grid.spacing
     count = int(np.clip(6 * mesh.area / h**2, 20_000, 1_000_000))
     samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
     area_normals = mesh.face_normals[faces] * mesh.area / count
-    cell = (samples + 1) / h
+    cell = (samples - grid.origin) / h
     low = np.clip(np.floor(cell).astype(int), 0, n - 2)
     fraction = cell - low
     density = np.zeros((n**3, 3))

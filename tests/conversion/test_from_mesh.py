@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 from topology import assert_manifold, component_count, euler_characteristic, loop_count
 
 from gshell_mi import UserError
+from gshell_mi.conversion import from_mesh
 from gshell_mi.extraction import extract
-from gshell_mi.fields import from_mesh
 from gshell_mi.lattice import GRIDS, TetLattice, make_lattice
 
 LATTICE = TetLattice(32)

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from gshell_mi import TetLattice
-from gshell_mi.fields.solid_distance import solid_distance
+from gshell_mi.conversion.solid_distance import solid_distance
 
 LATTICE = TetLattice(24)
 

@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import trimesh
 
-from ..lattice import Lattice
+from ..lattice import CubicGrid, Lattice
 
 _PAIRS = 1 << 22  # vertices times triangles at once: some 200 MiB
 
@@ -19,15 +19,25 @@ def nearest_faces(mesh: trimesh.Trimesh, lattice: Lattice, reach: float) -> tupl
     """
     import mitsuba as mi
 
-    triangles = mesh.triangles
-    cell = lattice.spacing
-    low = np.ceil((triangles.min(axis=1) - reach + 1) / cell).clip(0).astype(int)
-    high = np.floor((triangles.max(axis=1) + reach + 1) / cell).clip(max=lattice.resolution).astype(int)
-    size = np.maximum(high - low + 1, 0)
-    pairs = size.prod(axis=1)
     far = dr.opaque(mi.UInt64, 2**64 - 1)
     # Distance and face in one number, so that one atomic minimum finds both.
     best = dr.zeros(mi.UInt64, lattice.vertex_count) + far
+    for grid in lattice.grids:
+        _find_nearest(best, mesh.triangles, lattice, grid, reach)
+    found = best.numpy()
+    vertex = np.flatnonzero(found != 2**64 - 1)
+    return vertex, (found[vertex] & 0xFFFFFFFF).astype(np.int64)
+
+
+def _find_nearest(best, triangles: np.ndarray, lattice: Lattice, grid: CubicGrid, reach: float) -> None:
+    """Lowers ``best``, at the vertices of one grid, to the squared distance and the number of a triangle."""
+    import mitsuba as mi
+
+    low = np.ceil((triangles.min(axis=1) - reach - grid.origin) / grid.spacing).clip(0).astype(int)
+    high = np.floor((triangles.max(axis=1) + reach - grid.origin) / grid.spacing)
+    high = high.clip(max=grid.stride - 1).astype(int)
+    size = np.maximum(high - low + 1, 0)
+    pairs = size.prod(axis=1)
     corners = [mi.Point3f(np.ascontiguousarray(triangles[:, i].T, np.float32)) for i in range(3)]
     first = np.concatenate([[0], np.cumsum(pairs)])
     start = 0
@@ -37,7 +47,7 @@ def nearest_faces(mesh: trimesh.Trimesh, lattice: Lattice, reach: float) -> tupl
         index = np.arange(len(face)) - np.repeat(first[start:stop] - first[start], pairs[start:stop])
         x, index = index % size[face, 0] + low[face, 0], index // size[face, 0]
         y, z = index % size[face, 1] + low[face, 1], index // size[face, 1] + low[face, 2]
-        vertex = mi.UInt32((x + lattice.stride * (y + lattice.stride * z)).astype(np.uint32))
+        vertex = mi.UInt32((grid.first + x + grid.stride * (y + grid.stride * z)).astype(np.uint32))
         owner = mi.UInt32(face.astype(np.uint32))
         a, b, c = (dr.gather(mi.Point3f, corner, owner) for corner in corners)
         point = mi.Point3f(lattice.positions_of(vertex, mi.Float))
@@ -47,9 +57,6 @@ def nearest_faces(mesh: trimesh.Trimesh, lattice: Lattice, reach: float) -> tupl
         dr.scatter_reduce(dr.ReduceOp.Min, best, key, vertex, near, dr.ReduceMode.Local)
         dr.eval(best)
         start = stop
-    found = best.numpy()
-    vertex = np.flatnonzero(found != 2**64 - 1)
-    return vertex, (found[vertex] & 0xFFFFFFFF).astype(np.int64)
 
 
 def _squared_distance(p, u, v):

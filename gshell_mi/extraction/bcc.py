@@ -1,0 +1,65 @@
+"""Marching tetrahedra cut by the mSDF, on a body-centred cubic lattice.
+
+Its tetrahedra are those of a Kuhn lattice squeezed along the diagonal that they share (``BccLattice.BASIS``),
+so the tables and the numbering of edges and faces are the same, with half diagonals in place of axes. What
+differs is where the corners of a squeezed cell are, and that at the border some of its tetrahedra exist
+and others do not.
+"""
+
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..sign_scan import MISSING, is_inside
+from . import tet_tables as tables
+from .grid_extraction import ActiveCells
+from .tetrahedra import TetExtraction
+
+
+class BccExtraction(TetExtraction):
+    """Marching tetrahedra between two cubic grids."""
+
+    def corner(self, vertex: Any, corner: Any) -> Any:
+        return self.lattice.corner(vertex, corner)
+
+    def classify(self, inside: Any, cell: Any) -> ActiveCells:
+        # A corner that does not exist takes the sign of the cell's own vertex: no edge there is crossed.
+        own = is_inside(inside, cell)
+        signs = dr.select(own, self.uint_t(1), 0)
+        lacking = dr.zeros(self.uint_t)
+        for corner in range(1, 8):
+            vertex = self.corner(cell, self.uint_t(corner))
+            exists = vertex != MISSING
+            sign = dr.select(exists, is_inside(inside, vertex, exists), own)
+            signs |= dr.select(sign, self.uint_t(1 << corner), 0)
+            lacking |= dr.select(exists, 0, self.uint_t(1 << corner))
+        crossed = (signs ^ dr.select(own, self.uint_t(255), 0)) & self.EDGE_DIFFERENCES & ~self._lone(cell)
+        dr.eval(signs, crossed, lacking)
+        return ActiveCells(inside, cell, signs, crossed, lacking)
+
+    def _lone(self, cell: Any) -> Any:
+        """Bit d: the edge to corner d belongs to no tetrahedron. So it is with the outermost rows of each
+        grid on the side where the other grid does not reach beyond it, and with two half diagonals."""
+        x, y, z = self.lattice.coordinates(cell)
+        second, last = cell >= self.stride * self.stride * self.stride, self.stride - 1
+        end = dr.select(second, last, 0)
+        at_x, at_y, at_z = (number == end for number in (x, y, z))
+        along_z, along_y, along_x = at_x & at_y, at_x & at_z, at_y & at_z
+        in_corner = ~second & ((x + y + z == 0) | (x + y + z == 3 * last))
+        bits = ((along_z, 0b011), (along_y, 0b101), (along_x, 0b110), (in_corner, 0b111))
+        return sum(dr.select(lone, self.uint_t(1 << corner), 0) for lone, corner in bits)
+
+    def active_tets(self, cells: ActiveCells) -> Any:
+        existing = dr.gather(self.uint_t, self.uint_t(existing_tets_table()), cells.border)
+        return existing & dr.gather(self.uint_t, self.uint_t(tables.active_tets_table()), cells.signs)
+
+
+@cache
+def existing_tets_table() -> np.ndarray:
+    """``[lacking]``: bit i tells that tetrahedron i has all its corners; ``lacking`` has bit c set if corner
+    c of the cell does not exist."""
+    return np.array([sum(1 << tet for tet, corners in enumerate(tables.TETS)
+                         if not any(lacking >> corner & 1 for corner in corners))
+                     for lacking in range(256)], np.uint32)
