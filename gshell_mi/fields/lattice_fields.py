@@ -59,11 +59,15 @@ class LatticeFields:
 
         return BlockLattice(make_lattice(self.grid, self.block_resolution), mi.UInt32(self.blocks), sdf)
 
-    def to_lattice(self, resolution: int) -> LatticeFields:
-        """The fields interpolated on a lattice of another resolution; neutral weights. Needs a variant.
+    def to_lattice(self, resolution: int, grid: str | None = None) -> LatticeFields:
+        """The fields interpolated on another lattice; neutral weights. Needs a variant.
 
         Offsets are kept as lengths: they double in units of ``deform`` when the cells halve, and are
         clipped to what the new lattice allows.
+
+        Args:
+            resolution: cells per side.
+            grid: the kind of lattice; default: the same.
 
         Raises:
             UserError: the fields are stored in blocks, hence unknown elsewhere.
@@ -71,7 +75,7 @@ class LatticeFields:
         if self.blocks is not None:
             raise UserError("fields in blocks are known near their surface only and cannot be resampled; "
                             "from_mesh makes fields of any resolution from the extracted mesh")
-        old, new = self.lattice, make_lattice(self.grid, resolution)
+        old, new = self.lattice, make_lattice(grid or self.grid, resolution)
         if new == old:
             return LatticeFields(self.sdf, self.msdf, self.deform, self.grid)
         import mitsuba as mi
@@ -81,7 +85,7 @@ class LatticeFields:
         points = new.points(mi.Float)
         sdf, msdf, deform = (Interpolation(mi.Float(field), old)(points).numpy()
                              for field in (self.sdf, self.msdf, self.deform))
-        return LatticeFields(sdf, msdf, np.clip(deform * (old.max_offset / new.max_offset), -1, 1), self.grid)
+        return LatticeFields(sdf, msdf, np.clip(deform * (old.max_offset / new.max_offset), -1, 1), new.grid)
 
     def in_blocks(self, resolution: int | None = None) -> LatticeFields:
         """The fields in blocks around their surface, of this lattice or, interpolated, of a finer one.

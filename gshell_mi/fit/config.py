@@ -33,6 +33,8 @@ class FitConfig:
     """Seed of every random number of the fit."""
     resolution: int | None = None
     """Cells per side of the lattice; default: that of the scene's gshell shape (64)."""
+    grid: Literal["tet", "cube", "flexicubes", "bcc"] | None = None
+    """The kind of lattice; default: that of the scene's gshell shape (tet)."""
     start_resolution: int = 64
     """Cells per side, at most, up to the joint stage, which interpolates what it starts from. Unused if the
     scene gives the fields."""

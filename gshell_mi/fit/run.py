@@ -128,7 +128,7 @@ class _Fit:
         self.resolution = config.resolution or given.resolution
         # Given fields may have detail that no coarser lattice holds.
         coarse = self.resolution if self.scene.subject.filename else config.start_resolution
-        self.lattice = make_lattice(given.grid, min(self.resolution, coarse))
+        self.lattice = make_lattice(config.grid or given.grid, min(self.resolution, coarse))
         self.pixels = PixelPool(self.views, self.scene.targets)
         # Nothing of an earlier fit goes before all is known to be in order.
         make_output_folder(output, keep=resume)
@@ -165,8 +165,8 @@ class _Fit:
         """Says how much memory the fit needs, and refuses it if that much is not free."""
         sizes = np.array([sensor.film().crop_size() for sensor in sensors])
         resolution = self.config.resolution or subject.lattice.resolution
-        self.memory = MemoryEstimate.of(self.config, resolution, sizes, grid=subject.lattice.grid,
-                                        report=self.report)
+        grid = self.config.grid or subject.lattice.grid
+        self.memory = MemoryEstimate.of(self.config, resolution, sizes, grid=grid, report=self.report)
         free = free_memory_of_variant()
         told = "" if free is None else f"; {free / GIB:.1f} GiB are free"
         self.progress.tell(f"memory: about {self.memory.total / GIB:.1f} GiB{told}")
@@ -200,7 +200,7 @@ class _Fit:
 
     def _start_from_file(self) -> None:
         """Starts from the fields that the scene's gshell shape was given, openings included."""
-        fields = self.scene.subject.fields().to_lattice(self.lattice.resolution)
+        fields = self.scene.subject.fields().to_lattice(self.lattice.resolution, self.lattice.grid)
         if self.config.watertight or (fields.msdf > 0).all():
             self._enter("ghost", sdf=fields.sdf, hull=fields.sdf)
             return

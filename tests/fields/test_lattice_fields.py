@@ -63,13 +63,14 @@ def test_unreadable(tmp_path):
             LatticeFields.load(tmp_path / name)
 
 
-@pytest.mark.parametrize("resolution", [4, 5, 8, 16])
-def test_resampling_keeps_linear_fields_and_lengths(resolution):
-    old, new = TetLattice(8), TetLattice(resolution)
+@pytest.mark.parametrize(("resolution", "grid"),
+                         [(4, "tet"), (5, "tet"), (8, "tet"), (16, "tet"), (8, "cube"), (6, "bcc")])
+def test_resampling_keeps_linear_fields_and_lengths(resolution, grid):
+    old, new = TetLattice(8), make_lattice(grid, resolution)
     p = old.vertex_positions()
     offset = np.array([0.1, -0.2, 0.3]) * p  # of at most 0.3 in units of the old cells
     fields = LatticeFields(p[:, 0], p @ np.float32([1, 2, 3]), offset.astype(np.float32).ravel())
-    result = fields.to_lattice(resolution)
+    result = fields.to_lattice(resolution, grid)
     q = new.vertex_positions()
     assert result.lattice == new and result.sdf.dtype == result.deform.dtype == np.float32
     np.testing.assert_allclose(result.sdf, q[:, 0], atol=1e-5)

@@ -2,11 +2,13 @@
 
 import mitsuba as mi
 import numpy as np
+import pytest
 from bowl import SHORT, write_fit_scene
 
-from gshell_mi import TetLattice
+from gshell_mi import TetLattice, make_lattice
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit.__main__ import main
+from gshell_mi.fit.checkpoint import Checkpoint
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import given_material
 
@@ -19,7 +21,9 @@ def _cut_sphere() -> LatticeFields:
     return LatticeFields(sdf, (0.05 - points[:, 1]).astype(np.float32), np.zeros(3 * len(sdf), np.float32))
 
 
-def test_fields_of_the_scene_are_the_start(tmp_path):
+@pytest.mark.parametrize("grid", [None, "bcc"])
+def test_fields_of_the_scene_are_the_start(grid, tmp_path):
+    """On the lattice that they are given on, or interpolated on another."""
     path = write_fit_scene(tmp_path)
     _cut_sphere().save(tmp_path / "start.npz")
     xml = path.read_text()
@@ -31,7 +35,9 @@ def test_fields_of_the_scene_are_the_start(tmp_path):
     output = tmp_path / "out"
     arguments = [str(path), "-o", str(output), "--quiet", *SHORT]
     arguments[arguments.index("--iterations") + 1] = "0"
-    assert main(arguments) == 0
+    assert main(arguments + (["--grid", grid] if grid else [])) == 0
+    lattice = make_lattice(grid or "tet", RESOLUTION)
+    assert Checkpoint.load(output / "checkpoint.npz").arrays["sdf"].size == lattice.vertex_count
     mesh = mi.load_dict({"type": "ply", "filename": str(output / "mesh.ply")})
     parameters = mi.traverse(mesh)
     positions = np.array(parameters["vertex_positions"]).reshape(-1, 3)
