@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +14,7 @@ from .. import losses
 from ..topology import topology
 from .ghost_template import GhostTemplate, ghost_template
 from .hollows import hollows
-from .opening import clean_opacity, msdf_from_template, splat_to_lattice
+from .opening import clean_opacity, close_unjustified, msdf_from_template, splat_to_lattice, without_specks
 from .pixels import PixelPool
 from .radiance_ghost import RadianceGhost
 from .radiance_volume import RadianceVolume
@@ -23,6 +24,15 @@ _GAIN = 0.95
 
 #: Rays see into a hollow if they go this much farther than to the hull, in cells.
 _DEEPER = 0.7
+
+#: Space is empty below this opacity of a cell, and seen if this fraction of the rays get there.
+_EMPTY, _SEEN = 0.3, 0.03
+
+#: Logit of a vertex that is taken to be open (its negative).
+_CERTAIN = 3.0
+
+#: Rounds that bring the radiance of a new template from grey to where errors compare.
+_REFITS = 3
 
 #: Batches of rays that judge.
 _ERROR_STEPS = 20
@@ -63,14 +73,25 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], volume: RadianceVo
         distance = np.where(kept[label[tuple(owner)]], distance, -np.inf)
         after = ghost_template(subject, _carved(state, distance, lattice.spacing), like=before)
         ghosts[1] = _fitted(after, volume, known)
-    cleaned = clean_opacity(after.logits, after.vertices, after.faces, volume.config.ghost_min_area)
+    clean = partial(clean_opacity, vertices=after.vertices, faces=after.faces,
+                    min_area=volume.config.ghost_min_area)
+    cleaned = clean(after.logits)
     was, became = (topology(template.vertices, template.faces[(logits > 0)[template.faces].all(axis=1)])
                    for template, logits in ((before, before.logits), (after, cleaned)))
     if became.boundary_loops != was.boundary_loops or became.components > was.components:
         return None
+    if not volume.config.watertight:
+        # Now that what lies behind is in its place, the images may justify more openings.
+        proposed = clean(np.where(_in_empty_space(after, volume), -_CERTAIN, cleaned))
+        ghost = RadianceGhost(after.start, after.faces, volume.views, known, volume.config)
+        for _ in range(_REFITS):
+            ghost.refit(proposed > 0)
+        cleaned = clean(close_unjustified(proposed, after.faces, ghost.image_error, volume.config.ghost_gain))
     radiance, found = splat_to_lattice(mi.Float(ghosts[1].radiance()[0].ravel()), after.mesh, lattice)
+    msdf = without_specks(msdf_from_template(cleaned, after.mesh, lattice), after.mesh, lattice,
+                          volume.config.ghost_min_area)
     return _carved(state, distance, lattice.spacing) | {
-        "msdf": msdf_from_template(cleaned, after.mesh, lattice).numpy(),
+        "msdf": msdf.numpy(),
         "radiance": radiance.numpy().reshape(-1, 3), "known": found.numpy()}
 
 
@@ -80,9 +101,19 @@ def _carved(state: Mapping[str, np.ndarray], distance: np.ndarray, spacing: floa
     return fields | {"msdf": state["msdf"]}
 
 
+def _in_empty_space(template: GhostTemplate, volume: RadianceVolume) -> np.ndarray:
+    """(V,) whether there is nothing within a cell of a vertex, and it is seen."""
+    opacity, seen = ndimage.gaussian_filter(volume.opacity(), 1.0), volume.seen()
+    to_lattice = np.array(volume.to_lattice.matrix, np.float64).reshape(4, 4)
+    local = template.vertices @ to_lattice[:3, :3].T + to_lattice[:3, 3]
+    index = ((local + 1) * 0.5 * volume.resolution)[:, ::-1].T
+    return ((ndimage.map_coordinates(opacity, index, order=1) < _EMPTY)
+            & (ndimage.map_coordinates(seen, index, order=1) > _SEEN))
+
+
 def _fitted(template: GhostTemplate, volume: RadianceVolume, pixels: PixelPool) -> RadianceGhost:
     ghost = RadianceGhost(template.start, template.faces, volume.views, pixels, volume.config, glossy=True)
-    for _ in range(2):
+    for _ in range(_REFITS):
         ghost.refit(template.solid)
     return ghost
 

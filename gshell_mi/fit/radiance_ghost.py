@@ -18,6 +18,7 @@ from .. import losses
 from ..fields.smoothing import MeshDiffusion
 from ..views import PinholeViews
 from .config import FitConfig
+from .contrast import Contrast
 from .glossy_lobe import PER_VERTEX, SHARED, initial_lobe, mirrored_radiance
 from .mesh_normals import vertex_normals
 from .observer import Preview
@@ -67,6 +68,7 @@ class RadianceGhost:
         self.scene = _scene(self._positions, dr.ravel(self._faces), self.vertex_count, len(faces))
         self._offset = 1e-4 * float(np.ptp(vertices, axis=0).max())
         self._smooth = MeshDiffusion(faces, self.vertex_count, config.ghost_smoothing)
+        self._tone = Contrast(pixels.mean_radiance())
         grey = _inverse_softplus(pixels.mean_radiance())
         self.optimizer = mi.ad.Adam(lr=config.ghost_lr)
         for side in SIDES:
@@ -82,7 +84,7 @@ class RadianceGhost:
         config, optimizer = self.config, self.optimizer
         progress = iteration / config.ghost_iterations
         sample, radiance, alpha, _ = self._render(iteration)
-        image = losses.log_l1(radiance, sample.radiance)
+        image = losses.l1(self._tone(radiance), self._tone(sample.radiance))
         mask = losses.mask_l2(alpha, sample.alpha)
         # Where a mask shows daylight within the hull, every sheet on the ray is open: no doubt, no balance.
         daylight = losses.mask_l2(dr.select(sample.alpha < 0.01, alpha, 0), 0)
@@ -109,7 +111,7 @@ class RadianceGhost:
         self._set_opacity(np.where(opaque, _CERTAIN_LOGIT, -_CERTAIN_LOGIT))
         for step in range(_REFIT_STEPS):
             sample, radiance, _, _ = self._render(_EXTRA_STEP + step)
-            dr.backward(losses.log_l1(radiance, sample.radiance))
+            dr.backward(losses.l1(self._tone(radiance), self._tone(sample.radiance)))
             self.update(SIDES, self.config.ghost_lr)
 
     def image_error(self, opaque: np.ndarray) -> np.ndarray:
@@ -125,7 +127,7 @@ class RadianceGhost:
         with dr.suspend_grad():
             for step in range(_ERROR_STEPS):
                 sample, radiance, _, sheets = self._render(_EXTRA_STEP + _REFIT_STEPS + step)
-                difference = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
+                difference = dr.abs(self._tone(radiance) - self._tone(sample.radiance))
                 hit, face, weights, _ = sheets[0]
                 for corner in range(3):
                     share = weights[corner] * (difference.x + difference.y + difference.z)

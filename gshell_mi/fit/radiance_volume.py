@@ -14,10 +14,10 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from .. import losses
 from ..conversion.solid_distance import mesh_scene
 from ..views import PinholeViews
 from .config import FitConfig
+from .contrast import Contrast
 from .observer import Preview
 from .pixels import PixelPool
 
@@ -33,7 +33,7 @@ _COARSE_STEPS = 0.4
 #: The densities' logit at the start (about 0.13 optical depth per cell), and outside the hull.
 _FOG, _EMPTY = -2.0, -30.0
 
-#: Weight of the coverage's squared error beside that of the tonemapped radiance.
+#: Weight of the coverage's squared error beside that of the radiance.
 _MASK = 0.3
 
 #: Batches of rays that look where transmittance is high.
@@ -69,6 +69,7 @@ class RadianceVolume:
         self.scene = mesh_scene(vertices, faces)
         self.coarse_steps = round(_COARSE_STEPS * config.carving_iterations)
         self.mean_radiance = pixels.mean_radiance()
+        self._tone = Contrast(self.mean_radiance)
         #: By name; another one after the coarse steps.
         self.optimizers: dict[str, mi.ad.Adam] = {}
         full = len(hull) - 1
@@ -89,7 +90,7 @@ class RadianceVolume:
         radiance, transmittance = self._march(rays, iteration)
         dr.eval(radiance, transmittance)
         dr.enable_grad(radiance, transmittance)
-        image = dr.sum(dr.ravel(dr.square(losses.tonemap(radiance) - losses.tonemap(target))))
+        image = dr.sum(dr.ravel(dr.square(self._tone(radiance) - self._tone(target))))
         mask = dr.sum(dr.square(1 - transmittance - alpha))
         weight = self.pixels.mask_weight(_MASK)
         dr.backward(image + weight * mask)
