@@ -14,16 +14,16 @@ class Contrast:
     """The tone curve ``log(1 + 10 radiance / mean)``, scaled so that its slope at the mean is that of
     ``losses.tonemap``.
 
-    What is a tenth as bright as the mean, like the inside of a garment, weighs five times as much as it does
-    there. Linear in the bright: with a plain logarithm the noise of black pixels would rule.
+    What is a tenth as bright as the mean, like the inside of a garment, weighs four times as much as it does
+    with that. Linear in the bright: with a plain logarithm the noise of black pixels would rule.
 
     Args:
         mean: radiance of the targets.
 
     >>> tone, h = Contrast(0.5), 1e-2
     >>> slopes = [(tone(x + h) - tone(x - h)) / (2 * h) for x in (mi.Float(0.05), mi.Float(0.5))]
-    >>> [f"{slope[0]:.2f}" for slope in slopes]
-    ['3.69', '0.67']
+    >>> [f"{slope[0]:.1f}" for slope in slopes]
+    ['3.7', '0.7']
     """
 
     def __init__(self, mean: float):

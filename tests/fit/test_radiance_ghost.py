@@ -60,7 +60,7 @@ BACK = np.array([[0.3, 0.3, 3.0], [0.7, 0.2, 0.6]])
 
 def composite(ghost, origin, direction):
     ray = mi.Ray3f(origin, direction)
-    radiance, alpha = ghost.composite(ghost._sheets(ray), ray.d)
+    radiance, alpha = ghost.composite(ghost.sheets(ray), ray.d)
     return np.ravel(radiance), np.ravel(alpha)[0]
 
 
@@ -99,7 +99,7 @@ def test_derivatives_of_coverage(sheets):
     dr.enable_grad(opacity)
     old, sheets.optimizer["opacity"] = sheets.optimizer["opacity"], opacity
     ray = mi.Ray3f([0.1, 0.2, 5], [0, 0, -1])
-    _, alpha = sheets.composite(sheets._sheets(ray), ray.d)
+    _, alpha = sheets.composite(sheets.sheets(ray), ray.d)
     dr.backward(alpha)
     gradient = dr.grad(sheets.optimizer["opacity"]).numpy().reshape(2, 4).sum(1)
     sheets.optimizer["opacity"] = dr.detach(old)
