@@ -108,7 +108,7 @@ def test_log_has_a_line_per_step(whole):
     counts = {"ghost": 100, "carving": 10, "refinement": 8, "joint": 12}
     assert steps(whole) == [(stage, i) for stage, count in counts.items() for i in range(count)]
     losses = [json.loads(line)["image"] for line in (whole / "log.jsonl").read_text().splitlines()]
-    assert np.mean(losses[90:100]) < 0.7 * np.mean(losses[:10]), "the ghost learns"
+    assert np.mean(losses[90:100]) < 0.8 * np.mean(losses[:10]), "the ghost learns"
 
 
 def test_exported_scene_renders_without_the_package(whole):
