@@ -168,6 +168,8 @@ class RadianceVolume:
         ray = self.views.rays(sample.view, sample.film)
         hit = self.scene.ray_intersect_preliminary(ray, coherent=False)
         index = dr.compress(hit.is_valid())
+        if not dr.width(index):
+            index = mi.UInt32(0)  # a ray without steps: arrays are never empty
         # The others have nothing to march through.
         origin, direction, t, target, alpha = (
             dr.gather(type(value), value, index)

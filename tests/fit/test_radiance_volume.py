@@ -26,6 +26,16 @@ def march(volume, rays, **options):
     return volume._march(rays, 5, **options)
 
 
+def test_no_ray_meets_the_hull(seen):
+    views, pixels, _ = seen
+    hull, vertices, faces = hull_of(32)
+    volume = RadianceVolume(hull, vertices + 50, faces, mi.ScalarTransform4f(), views, pixels, CONFIG)
+    before = volume.opacity()
+    assert np.isfinite(list(volume.step(0).values())).all()
+    np.testing.assert_array_equal(volume.opacity(), before)
+    assert not volume.seen().any()
+
+
 def test_even_fog_absorbs_exponentially(seen):
     volume = make(seen)
     rays, _, _ = volume._rays(0)
