@@ -164,7 +164,10 @@ class RadianceGhost:
     def _render(self, step: int) -> tuple:
         """The random pixels of a step, their radiance and coverage, and the sheets behind them."""
         sample, ray, sheets = self.look(step)
-        return sample, *self.composite(sheets, ray.d), sheets
+        radiance, alpha = self.composite(sheets, ray.d)
+        # Each of the losses would do this again.
+        dr.eval(radiance, alpha)
+        return sample, radiance, alpha, sheets
 
     def look(self, step: int) -> tuple[PixelSample, mi.Ray3f, list[tuple]]:
         """The random pixels of a step, the rays through them and the sheets that these meet."""

@@ -35,7 +35,7 @@ from .config import FitConfig, default_output
 from .depth import check_depth
 from .field_fitting import FieldFitting
 from .findings import findings
-from .ghost_template import ghost_template, length_scale
+from .ghost_template import GhostTemplate, ghost_template, length_scale
 from .interrupt import Interrupt
 from .joint import JointStage
 from .memory import MemoryEstimate
@@ -262,7 +262,25 @@ class _Fit:
         """Moves the template inside the hull, and the fields with it."""
         state = self.checkpoint.arrays
         template = ghost_template(self.scene.subject, state)
-        vertices, faces, solid, start = template.vertices, template.faces, template.solid, template.start
+        # Without a refinement, what was grown for being thin shrinks back.
+        moved, kept = template.start, False
+        radiance = template.mesh.interpolate(mi.Float(state["radiance"].ravel()), 3).numpy().T
+        if self.config.refinement_iterations:
+            moved, radiance, kept = self._refined(template, state)
+        fields = None
+        if (moved != template.vertices).any():
+            with self._timed("refinement"):
+                before = LatticeFields.closed(state["sdf"], self.lattice.grid)
+                self.scene.subject.set_fields(dataclasses.replace(before, msdf=state["msdf"]))
+                fields = recast(self.scene.subject, template.vertices, moved, template.faces, template.logits,
+                                radiance, self.config.ghost_min_area)
+        self.checkpoint.facts["refinement_kept"] = kept and fields is not None
+        self._enter("joint", **(fields or {name: state[name] for name in _SURFACE}), light=state["light"])
+
+    def _refined(self, template: GhostTemplate,
+                 state: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Vertices after the refinement, or their start if that is better; their radiance; which it was."""
+        faces, solid, start = template.faces, template.solid, template.start
         known, unknown = self._split_pixels()
         ghost = RadianceGhost(start, faces, self.views, known, self.config, glossy=True)
         for _ in range(3):
@@ -272,7 +290,7 @@ class _Fit:
         if self.pixels.has_alpha:
             alphas = [target.rgba[..., 3] for target in self.scene.targets]
             outlines = Outlines(self.views, alphas, faces, solid)
-        cell = self.lattice.spacing * length_scale(self.scene.subject.to_world)
+        cell = self.scene.subject.cell_size
         refinement = PhotometricRefinement(ghost, start, faces, outlines, cell, self.config)
         self._iterate("refinement", self.config.refinement_iterations, refinement,
                       {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
@@ -280,16 +298,7 @@ class _Fit:
             ghost.move(mi.Float(refinement.positions().ravel()))
             ghost.refit(solid)
             kept = ghost.unexplained(unknown) < self.config.refinement_gain * unexplained
-            # Without a refinement, what was grown for being thin shrinks back.
-            moved = refinement.positions() if kept else start
-            fields = None
-            if (moved != vertices).any():
-                before = LatticeFields.closed(state["sdf"], self.lattice.grid)
-                self.scene.subject.set_fields(dataclasses.replace(before, msdf=state["msdf"]))
-                fields = recast(self.scene.subject, vertices, moved, faces, template.logits,
-                                ghost.radiance()[0], self.config.ghost_min_area)
-        self.checkpoint.facts["refinement_kept"] = kept and fields is not None
-        self._enter("joint", **(fields or {name: state[name] for name in _SURFACE}), light=state["light"])
+        return refinement.positions() if kept else start, ghost.radiance()[0], kept
 
     def _split_pixels(self) -> tuple[PixelPool, PixelPool]:
         """Pixels to learn the shape from, and those of views kept apart to judge it."""
