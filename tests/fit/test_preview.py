@@ -1,8 +1,10 @@
 """``--preview`` changes defaults, and only those."""
 
+import json
 from types import SimpleNamespace
 
 import pytest
+from bowl import CLOSED, SHORT
 
 from gshell_mi.fit import FitConfig, run
 from gshell_mi.fit.__main__ import main
@@ -49,6 +51,14 @@ def test_other_options_override_those_of_the_preview(given, order):
 
 def test_a_value_equal_to_the_usual_default_counts_too(given):
     assert given("--preview", "--spp", str(FitConfig().spp)).config.spp == FitConfig().spp
+
+
+def test_without_refinement_there_is_no_ghost_for_it(bowl_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "PhotometricRefinement", None)
+    short = [*SHORT, *CLOSED, "--iterations", "1", "--refinement-iterations", "0"]
+    assert main([str(bowl_scene), "-o", str(tmp_path), *short]) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["refinement_kept"] is False and metrics["counts"]["faces"] > 0
 
 
 def test_mistakes_are_told_as_without(capfd):
