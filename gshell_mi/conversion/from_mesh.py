@@ -17,6 +17,7 @@ from ..extraction import SurfaceMesh, extract
 from ..fields import LatticeFields
 from ..lattice import CubicGrid, Lattice
 from ..topology import vertex_components
+from .bridges import bridges
 from .mesh_distance import Feet, MeshFeet, nearest_faces
 
 _BAND_CELLS = 3.0  # distances are exact and signs those of the nearest face this near the mesh
@@ -30,6 +31,7 @@ _SIGN_ROUNDS = 12  # of fitting the mSDF, each with more weight on what has the 
 _DAMPING = 1e-2  # weight of the start of the fit, so that it has one solution
 _SPECK = 12  # patches of fewer vertices have the wrong sign
 _UNEXPLAINED = 0.02  # as have those of a smaller fraction of the template's vertices and far from any rim
+_BRIDGE_CELLS = 3.0  # ends of an edge on the surface are no farther from each other along the mesh
 
 
 def from_mesh(
@@ -41,8 +43,9 @@ def from_mesh(
     and Aanaes 2005). Farther away, and across openings, the sign is that of the generalised winding number
     (Jacobson et al. 2013) as a harmonic function on the lattice that jumps by 1 across the mesh, which caps
     the openings. ``msdf`` is fitted, at the vertices of the template that results, to the distance to the
-    rims along the mesh, negative past them and on the caps. An open mesh must be consistently oriented;
-    layers closer to each other than about two cells run into each other.
+    rims along the mesh, negative past them and on the caps. An open mesh must be consistently oriented.
+    Layers closer to each other than about two cells run into each other here and there, but their rims stay
+    apart as far as the lattice can tell them.
 
     Args:
         source: a file that trimesh reads, or a mesh.
@@ -107,9 +110,27 @@ def _load(source: str | Path | trimesh.Trimesh, name: str) -> trimesh.Trimesh:
         raise UserError(f"{name}: holds no triangles")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.update_faces(mesh.nondegenerate_faces())
+    mesh = _without_pinches(mesh)
     if mesh.is_watertight and mesh.volume < 0:
         mesh.invert()
     return mesh
+
+
+def _without_pinches(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The same faces, with a vertex of its own for each fan of faces that meets others in a point only.
+
+    So may cloth that touches itself come out of a file, where equal positions are one vertex.
+    """
+    corner = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
+    side = np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1).reshape(-1, 2)
+    ends = mesh.faces.ravel()[side]
+    side = np.take_along_axis(side, ends.argsort(axis=1), axis=1)
+    _, first, edge = np.unique(np.sort(ends, axis=1), axis=0, return_index=True, return_inverse=True)
+    # Faces that share an edge share its ends.
+    same = np.stack([side, side[first[edge.reshape(-1)]]], axis=-1).reshape(-1, 2)
+    _, chosen, faces = np.unique(vertex_components(same, corner.size)[1], return_index=True,
+                                 return_inverse=True)
+    return trimesh.Trimesh(mesh.vertices[mesh.faces.ravel()[chosen]], faces.reshape(-1, 3), process=False)
 
 
 def _far_distance(lattice: Lattice, points: np.ndarray, band: np.ndarray, feet: Feet) -> np.ndarray:
@@ -259,6 +280,11 @@ def _rim_distance(
         patch = _patches(wanted > 0, edges)
         size, explained = np.bincount(patch), np.bincount(patch, beside_rim) > 0
         wanted[((size < _SPECK) | (~explained & (size < _UNEXPLAINED * len(wanted))))[patch]] *= -1
+    sheet = (wanted[edges] > 0).all(axis=1) & beside_rim[edges].any(axis=1) & known[edges].all(axis=1)
+    leaps = bridges(feet_of.mesh, feet, (np.cumsum(known) - 1)[edges[sheet]], _BRIDGE_CELLS * h)
+    # They are cut at the end that is nearer to a rim.
+    nearer = np.take_along_axis(leaps, inner[leaps].argmin(axis=1)[:, None], axis=1)
+    wanted[np.flatnonzero(known)[nearer]] = -h / 4
     return np.copysign(np.maximum(np.abs(wanted), 1e-3 * h), wanted), beside_rim
 
 

@@ -81,6 +81,8 @@ class Feet:
 
     point: np.ndarray
     """(n, 3)."""
+    face: np.ndarray
+    """(n,): the face that they lie on."""
     distance: np.ndarray
     """(n,), not negative."""
     normal: np.ndarray
@@ -133,7 +135,7 @@ class MeshFeet:
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
         offset = points - foot
         height = np.einsum("ij,ij->i", offset, normal)
-        return Feet(foot, np.linalg.norm(offset, axis=1), normal, height, on_rim)
+        return Feet(foot, face, np.linalg.norm(offset, axis=1), normal, height, on_rim)
 
     def rim_samples(self, spacing: float) -> np.ndarray:
         """Points along the rims, no farther apart than ``spacing``."""

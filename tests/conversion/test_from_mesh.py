@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
-from topology import assert_manifold, component_count, euler_characteristic, loop_count
+from topology import assert_manifold, boundary_edges, component_count, euler_characteristic, loop_count
 
 from gshell_mi import UserError
 from gshell_mi.conversion import from_mesh
+from gshell_mi.conversion.from_mesh import _without_pinches
 from gshell_mi.extraction import extract
 from gshell_mi.lattice import GRIDS, TetLattice, make_lattice
 
@@ -108,6 +109,32 @@ def test_layers_closer_than_a_cell_stay_apart(gap):
         fields = from_mesh(mesh, LATTICE)
         _, faces, _ = extract(LATTICE, mi.Float(fields.sdf), mi.Float(fields.msdf)).to_numpy()
         assert (loop_count(faces), component_count(faces), euler_characteristic(faces)) == (1, 1, 1)
+
+
+def _pinched_tube():
+    """A tube whose lower rim is drawn in to the shape of an eight, so that it touches itself in a point."""
+
+    def point(u, v):
+        x, z = np.cos(2 * np.pi * u), np.sin(2 * np.pi * u)
+        return 0.6 * x, 0.5 - v, 0.6 * z * (1 - v + v * np.abs(x))
+
+    return _grid(point, True)
+
+
+def test_a_rim_that_touches_itself_stays_one():
+    mesh = _pinched_tube()
+    mesh.merge_vertices()
+    uses = np.bincount(np.ravel(boundary_edges(mesh.faces)))
+    assert (uses == 4).sum() == 1, "two vertices of the rim have become one"
+    split = _without_pinches(mesh)
+    assert (len(split.vertices), len(split.faces)) == (len(mesh.vertices) + 1, len(mesh.faces))
+    np.testing.assert_array_equal(split.triangles, mesh.triangles)
+    assert_manifold(split.vertices, split.faces)
+    assert loop_count(split.faces) == 2
+    fields = from_mesh(mesh, LATTICE)
+    vertices, faces, _ = extract(LATTICE, mi.Float(fields.sdf), mi.Float(fields.msdf)).to_numpy()
+    assert_manifold(vertices, faces)
+    assert (loop_count(faces), component_count(faces)) == (2, 1)
 
 
 @pytest.mark.parametrize("grid", GRIDS)
