@@ -8,6 +8,9 @@ import json
 from gshell_mi.errors import UserError
 from gshell_mi.fit import FitConfig
 
+#: Types of the settings whose default is None.
+_OPTIONAL = {"resolution": int, "grid": str}
+
 
 def parsed_settings(pairs: list[str]) -> FitConfig:
     """The configuration that ``["resolution=48", "image_loss=l1"]`` stands for; the rest are defaults.
@@ -24,7 +27,7 @@ def parsed_settings(pairs: list[str]) -> FitConfig:
             value = json.loads(text)
         except ValueError:
             value = text
-        kind = int if defaults[name] is None else type(defaults[name])
+        kind = _OPTIONAL.get(name, type(defaults[name]))
         if kind is float and type(value) is int:
             value = float(value)
         if type(value) is not kind:

@@ -129,7 +129,7 @@ def test_a_rim_that_touches_itself_stays_one():
     split = _without_pinches(mesh)
     assert (len(split.vertices), len(split.faces)) == (len(mesh.vertices) + 1, len(mesh.faces))
     np.testing.assert_array_equal(split.triangles, mesh.triangles)
-    assert_manifold(split.vertices, split.faces)
+    assert np.bincount(np.ravel(boundary_edges(split.faces))).max() == 2
     assert loop_count(split.faces) == 2
     fields = from_mesh(mesh, LATTICE)
     vertices, faces, _ = extract(LATTICE, mi.Float(fields.sdf), mi.Float(fields.msdf)).to_numpy()

@@ -72,9 +72,11 @@ def test_the_rows_switch_every_loss():
 
 
 def test_settings_as_text():
-    config = parsed_settings(["resolution=48", "ghost_gain=1", "image_loss=l1", "watertight=true"])
-    assert config == FitConfig(resolution=48, ghost_gain=1.0, image_loss="l1", watertight=True)
-    assert as_flags(non_default(config)) == "--resolution 48 --watertight --ghost-gain 1 --image-loss l1"
+    config = parsed_settings(["resolution=48", "grid=bcc", "ghost_gain=1", "image_loss=l1",
+                              "watertight=true"])
+    assert config == FitConfig(resolution=48, grid="bcc", ghost_gain=1.0, image_loss="l1", watertight=True)
+    assert as_flags(non_default(config)) == ("--resolution 48 --grid bcc --watertight --ghost-gain 1 "
+                                             "--image-loss l1")
 
 
 @pytest.mark.parametrize(("pair", "complaint"), [
