@@ -10,7 +10,12 @@ from gshell_mi.extraction import extract
 from gshell_mi.lattice import GRIDS, TetLattice, make_lattice
 
 
-@pytest.fixture(params=GRIDS)
+def test_a_grid_without_blocks_is_refused():
+    with pytest.raises(UserError, match="'bcc' cannot be stored in blocks"):
+        BlockLattice.around(make_lattice("bcc", 70), _ball, mi.Float)
+
+
+@pytest.fixture(params=[grid for grid in GRIDS if make_lattice(grid, 8).fits_in_blocks])
 def lattice(request):
     return make_lattice(request.param, 70)
 

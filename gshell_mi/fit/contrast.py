@@ -9,6 +9,9 @@ from .. import losses
 
 _CONTRAST = 10.0
 
+#: Targets that are darker are taken to be this bright.
+_BLACK = 1e-3
+
 
 class Contrast:
     """The tone curve ``log(1 + 10 radiance / mean)``, scaled so that its slope at the mean is that of
@@ -24,9 +27,12 @@ class Contrast:
     >>> slopes = [(tone(x + h) - tone(x - h)) / (2 * h) for x in (mi.Float(0.05), mi.Float(0.5))]
     >>> [f"{slope[0]:.1f}" for slope in slopes]
     ['3.7', '0.7']
+    >>> Contrast(0.0)(mi.Float(0))[0]       # all targets are black
+    0.0
     """
 
     def __init__(self, mean: float):
+        mean = max(mean, _BLACK)
         self._scale = dr.opaque(mi.Float, _CONTRAST / mean)
         self._unit = dr.opaque(mi.Float, (1 + 1 / _CONTRAST) * mean / (1 + mean))
 

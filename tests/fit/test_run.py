@@ -211,8 +211,9 @@ def test_killed_and_resumed(bowl_scene, whole, tmp_path, record_property):
     between_whole_runs, to_killed = distance(whole, again), distance(whole, killed)
     record_property("distance of two whole runs", between_whole_runs)
     record_property("distance of a whole and a killed run", to_killed)
-    # Sums over threads depend on their order, and rounding grows from step to step.
-    assert to_killed <= 2 * between_whole_runs + 2e-4
+    # Sums over threads depend on their order, and rounding grows from step to step: 2e-5 to 4e-4 were seen,
+    # so one pair of whole runs is no bound. A cell is 0.1.
+    assert to_killed <= 2 * between_whole_runs + 1e-3
 
 
 def test_asset_and_report_come_with_a_fit(bowl_scene, tmp_path):
