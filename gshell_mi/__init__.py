@@ -10,7 +10,7 @@ The rooms, in the order in which data flows through them:
 - ``capture``: photographs with known cameras become a fit scene, ``python -m gshell_mi.capture``
 - ``targets``, ``views``, ``scene``: what a fit starts from
 - ``parametrisation``: what an optimiser changes in place of the lattice fields
-- ``losses``, ``material``, ``light``, ``fit``: the optimisation, ``python -m gshell_mi.fit``
+- ``activations``, ``losses``, ``material``, ``light``, ``fit``: the optimisation, ``python -m gshell_mi.fit``
 - ``viewer``: a look at it while it runs, ``--viewer``
 - ``images``, ``topology``, ``export``, ``turntable``, ``report``: what it leaves behind
 - ``evaluation``, ``compare``: how good it is

@@ -81,6 +81,11 @@ def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> mi.Mesh
     return mesh
 
 
+def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> mi.Scene:
+    """A scene of just that mesh, named ``mesh``, for its rays."""
+    return mi.load_dict({"type": "scene", "mesh": triangle_mesh("mesh", vertices, faces)})
+
+
 def write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:
     """Writes an image by its suffix; unlike Mitsuba's error, its ``OSError`` says what is wrong and where."""
     try:

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .compat import triangle_mesh
+from .compat import mesh_scene
 from .topology import topology, vertex_components
 from .views import PinholeViews
 
@@ -117,7 +117,7 @@ def _floaters(vertex_count: int, faces: np.ndarray, area: np.ndarray) -> int:
 def _touching(centers: np.ndarray, normals: np.ndarray, template: tuple[np.ndarray, np.ndarray],
               cell: float) -> np.ndarray:
     """Which points of the template have another sheet of it within a cell, before or behind them."""
-    scene = mi.load_dict({"type": "scene", "template": triangle_mesh("template", *template)})
+    scene = mesh_scene(*template)
     origin, normal = _vectors(mi.Point3f, centers), _vectors(mi.Vector3f, normals)
     touching = np.zeros(len(centers), bool)
     for direction in (normal, -normal):
@@ -129,7 +129,7 @@ def _touching(centers: np.ndarray, normals: np.ndarray, template: tuple[np.ndarr
 
 def _seen(points: np.ndarray, surface: tuple[np.ndarray, np.ndarray], views: PinholeViews) -> np.ndarray:
     """Which points of a surface some view frames with nothing before them."""
-    scene = mi.load_dict({"type": "scene", "surface": triangle_mesh("surface", *surface)})
+    scene = mesh_scene(*surface)
     target = _vectors(mi.Point3f, points)
     seen = dr.full(mi.Bool, False, len(points))
     for view in range(len(views)):

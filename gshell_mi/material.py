@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .activations import sigmoid
 from .fields.carried import Carried
 
 #: Range of roughness: below, paths to a small light become too rare for a fit's few samples.
@@ -48,7 +49,7 @@ class MaterialField:
 
     def values(self) -> dict[str, mi.Float]:
         """The lattice fields themselves, all in [0, 1], by attribute name."""
-        unit = {name: dr.rcp(1 + dr.exp(-logits)) for name, logits in self.parameters.items()}
+        unit = {name: sigmoid(logits) for name, logits in self.parameters.items()}
         low, high = ROUGHNESS_RANGE
         unit["vertex_roughness"] = low + (high - low) * unit["vertex_roughness"]
         return unit

@@ -196,8 +196,12 @@ class GShell(mi.Mesh):
     @property
     def cell_size(self) -> float:
         """Side of a cell in world units: the cube root of its volume."""
-        volume = abs(np.linalg.det(np.array(self.to_world.matrix)[:3, :3]))
-        return float(self.lattice.spacing * volume ** (1 / 3))
+        return self.lattice.spacing * self.length_scale
+
+    @property
+    def length_scale(self) -> float:
+        """World units per lattice unit: the cube root of the transform's volume ratio."""
+        return float(abs(np.linalg.det(np.array(self.to_world.matrix)[:3, :3])) ** (1 / 3))
 
     @property
     def field_names(self) -> tuple[str, ...]:

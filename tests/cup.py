@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from gshell_mi.conversion.solid_distance import mesh_scene
+from gshell_mi.compat import mesh_scene
 from gshell_mi.fit.config import FitConfig
 from gshell_mi.fit.pixels import PixelPool
 from gshell_mi.targets import Target

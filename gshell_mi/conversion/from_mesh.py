@@ -156,7 +156,7 @@ def _separate_layers(sdf: np.ndarray, mesh: trimesh.Trimesh, lattice: Lattice, b
     import mitsuba as mi
 
     vertices, faces = _beyond_rims(mesh, lattice.spacing)
-    scene = mi.load_dict({"type": "scene", "mesh": compat.triangle_mesh("mesh", vertices, faces)})
+    scene = compat.mesh_scene(vertices, faces)
     inner = band[(np.abs(lattice.vertex_positions()[band]) < 1 - 1.5 * lattice.spacing).all(axis=1)]
     spacing = lattice.spacing
     flips = []

@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 from scipy import ndimage
 
+from ..compat import mesh_scene
 from ..fields.lattice_fields import closed_at_border
 from ..lattice import Lattice
 from .mesh_distance import MeshFeet, nearest_faces
@@ -55,16 +56,6 @@ def solid_distance(vertices: np.ndarray, faces: np.ndarray, solid: np.ndarray,
         part = part[tuple(nearest)]
         field[grid.ids] = (part + np.sign(part) * away * grid.spacing).ravel()
     return closed_at_border(field, lattice)
-
-
-def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> mi.Scene:
-    """A scene of just that mesh, for its rays."""
-    mesh = mi.Mesh("mesh", len(vertices), len(faces))
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = vertices.astype(np.float32).ravel()
-    parameters["faces"] = faces.astype(np.uint32).ravel()
-    parameters.update()
-    return mi.load_dict({"type": "scene", "mesh": mesh})
 
 
 def _inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from ..compat import triangle_mesh
+from ..compat import mesh_scene
 from ..images import srgb
 from .ply import FittedMesh
 
@@ -84,7 +84,7 @@ def bake(fine: FittedMesh, vertices: np.ndarray, normals: np.ndarray, tangents: 
 def project(fine: FittedMesh, points: np.ndarray, normals: np.ndarray) -> SurfacePoints:
     """For each of (N, 3) points the nearest point of ``fine`` along its normal, on either side, that faces
     the same way; without one the nearest vertex."""
-    scene = _scene(fine.vertices, fine.faces)
+    scene = mesh_scene(fine.vertices, fine.faces)
     geometric = _unit(_face_normals(fine.vertices, fine.faces))
     best = np.full(len(points), np.inf)
     index, weights = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
@@ -111,7 +111,7 @@ def project(fine: FittedMesh, points: np.ndarray, normals: np.ndarray) -> Surfac
 def openness(mesh: FittedMesh) -> np.ndarray:
     """Ambient occlusion in glTF's sense: the cosine-weighted fraction of the directions on the front of each
     vertex in which no surface is hit; (V,)."""
-    scene = _scene(mesh.vertices, mesh.faces)
+    scene = mesh_scene(mesh.vertices, mesh.faces)
     count = len(mesh.vertices)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, count * _OCCLUSION_RAYS)
@@ -151,7 +151,7 @@ def vertex_tangents(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray
 def _texels(faces: np.ndarray, uv: np.ndarray, size: int) -> tuple[np.ndarray, SurfacePoints]:
     """Which texels (size, size) a chart covers, and the point of the mesh at each of these."""
     flat = np.concatenate([uv, np.zeros((len(uv), 1))], axis=1)
-    scene = _scene(flat, faces)
+    scene = mesh_scene(flat, faces)
     row, column = np.divmod(np.arange(size * size), size)
     x, y = (column + 0.5) / size, 1 - (row + 0.5) / size
     origin = np.stack([x, y, np.ones(size * size)], axis=1)
@@ -167,10 +167,6 @@ def _image(values: np.ndarray, filled: np.ndarray) -> np.ndarray:
     image[filled] = values
     nearest = distance_transform_edt(~filled, return_distances=False, return_indices=True)
     return (np.clip(image[tuple(nearest)], 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def _scene(vertices: np.ndarray, faces: np.ndarray) -> mi.Scene:
-    return mi.load_dict({"type": "scene", "mesh": triangle_mesh("mesh", vertices, faces)})
 
 
 def _point(values: np.ndarray) -> mi.Point3f:

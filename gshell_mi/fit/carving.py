@@ -11,9 +11,10 @@ import numpy as np
 from scipy import ndimage
 
 from .. import losses
+from ..lattice import Lattice
 from ..topology import topology
 from .ghost_template import GhostTemplate, ghost_template
-from .hollows import hollows
+from .hollows import SEEN, hollows
 from .opening import clean_opacity, close_unjustified, msdf_from_template, splat_to_lattice, without_specks
 from .pixels import PixelPool
 from .radiance_ghost import RadianceGhost
@@ -25,26 +26,24 @@ _GAIN = 0.95
 #: Rays see into a hollow if they go this much farther than to the hull, in cells.
 _DEEPER = 0.7
 
-#: Space is empty below this opacity of a cell, and seen if this fraction of the rays get there.
-_EMPTY, _SEEN = 0.3, 0.03
+#: Space is empty below this opacity of a cell.
+_EMPTY = 0.3
 
 #: Logit of a vertex that is taken to be open (its negative).
 _CERTAIN = 3.0
-
-#: Rounds that bring the radiance of a new template from grey to where errors compare.
-_REFITS = 3
 
 #: Batches of rays that judge.
 _ERROR_STEPS = 20
 
 
-def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], volume: RadianceVolume, known: PixelPool,
-          unknown: PixelPool) -> dict[str, np.ndarray] | None:
+def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, volume: RadianceVolume,
+          known: PixelPool, unknown: PixelPool) -> dict[str, np.ndarray] | None:
     """Hollows out a template as far as unseen views are explained better.
 
     Args:
         subject: the gshell shape; it is left with other fields.
         state: ``sdf``, ``hull`` and ``msdf`` on the lattice.
+        lattice: whose vertices make a cube.
         volume: trained.
         known, unknown: pixels to fit the radiance of both templates to, and those that judge them.
 
@@ -52,14 +51,17 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], volume: RadianceVo
         ``sdf``, ``hull``, ``msdf``, ``radiance`` (n, 3) and ``known`` (n,) on the lattice; None if there is
         no hollow, none helps, or the surface would get other boundary loops.
     """
-    lattice = subject.lattice
     shape = (lattice.stride,) * 3
+    opacity, seen = volume.opacity(), volume.seen()
     distance = hollows(*(state[name].reshape(shape) / lattice.spacing for name in ("hull", "msdf")),
-                       volume.opacity(), volume.seen())
-    if distance is None or not (_carved(state, distance, lattice.spacing)["sdf"] < 0).any():
+                       opacity, seen)
+    if distance is None:
         return None
-    before = ghost_template(subject, state)
-    after = ghost_template(subject, _carved(state, distance, lattice.spacing), like=before)
+    carved = _carved(state, distance, lattice.spacing)
+    if not (carved["sdf"] < 0).any():
+        return None
+    before = ghost_template(subject, state, lattice)
+    after = ghost_template(subject, carved, lattice, like=before)
     label, count = ndimage.label(distance > 0, np.ones((3, 3, 3)))
     label = np.where(label, label, ndimage.maximum_filter(label, size=3))
     ghosts = [_fitted(template, volume, known) for template in (before, after)]
@@ -71,7 +73,8 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], volume: RadianceVo
         # Vertices beside a hollow belong to it.
         owner = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
         distance = np.where(kept[label[tuple(owner)]], distance, -np.inf)
-        after = ghost_template(subject, _carved(state, distance, lattice.spacing), like=before)
+        carved = _carved(state, distance, lattice.spacing)
+        after = ghost_template(subject, carved, lattice, like=before)
         ghosts[1] = _fitted(after, volume, known)
     clean = partial(clean_opacity, vertices=after.vertices, faces=after.faces,
                     min_area=volume.config.ghost_min_area)
@@ -82,17 +85,15 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], volume: RadianceVo
         return None
     if not volume.config.watertight:
         # Now that what lies behind is in its place, the images may justify more openings.
-        proposed = clean(np.where(_in_empty_space(after, volume), -_CERTAIN, cleaned))
+        proposed = clean(np.where(_in_empty_space(after, volume, opacity, seen), -_CERTAIN, cleaned))
         ghost = RadianceGhost(after.start, after.faces, volume.views, known, volume.config)
-        for _ in range(_REFITS):
-            ghost.refit(proposed > 0)
+        ghost.refit_anew(proposed > 0)
         cleaned = clean(close_unjustified(proposed, after.faces, ghost.image_error, volume.config.ghost_gain))
     radiance, found = splat_to_lattice(mi.Float(ghosts[1].radiance()[0].ravel()), after.mesh, lattice)
     msdf = without_specks(msdf_from_template(cleaned, after.mesh, lattice), after.mesh, lattice,
                           volume.config.ghost_min_area)
-    return _carved(state, distance, lattice.spacing) | {
-        "msdf": msdf.numpy(),
-        "radiance": radiance.numpy().reshape(-1, 3), "known": found.numpy()}
+    return carved | {"msdf": msdf.numpy(), "radiance": radiance.numpy().reshape(-1, 3),
+                     "known": found.numpy()}
 
 
 def _carved(state: Mapping[str, np.ndarray], distance: np.ndarray, spacing: float) -> dict[str, np.ndarray]:
@@ -101,20 +102,19 @@ def _carved(state: Mapping[str, np.ndarray], distance: np.ndarray, spacing: floa
     return fields | {"msdf": state["msdf"]}
 
 
-def _in_empty_space(template: GhostTemplate, volume: RadianceVolume) -> np.ndarray:
+def _in_empty_space(template: GhostTemplate, volume: RadianceVolume, opacity: np.ndarray,
+                    seen: np.ndarray) -> np.ndarray:
     """(V,) whether there is nothing within a cell of a vertex, and it is seen."""
-    opacity, seen = ndimage.gaussian_filter(volume.opacity(), 1.0), volume.seen()
-    to_lattice = np.array(volume.to_lattice.matrix, np.float64).reshape(4, 4)
-    local = template.vertices @ to_lattice[:3, :3].T + to_lattice[:3, 3]
-    index = ((local + 1) * 0.5 * volume.resolution)[:, ::-1].T
-    return ((ndimage.map_coordinates(opacity, index, order=1) < _EMPTY)
-            & (ndimage.map_coordinates(seen, index, order=1) > _SEEN))
+    local = volume.to_lattice @ mi.Point3f(np.ascontiguousarray(template.vertices.T, np.float32))
+    index = ((local + 1) * (0.5 * volume.resolution)).numpy()[::-1]
+    around = ndimage.gaussian_filter(opacity, 1.0)
+    return ((ndimage.map_coordinates(around, index, order=1) < _EMPTY)
+            & (ndimage.map_coordinates(seen, index, order=1) > SEEN))
 
 
 def _fitted(template: GhostTemplate, volume: RadianceVolume, pixels: PixelPool) -> RadianceGhost:
     ghost = RadianceGhost(template.start, template.faces, volume.views, pixels, volume.config, glossy=True)
-    for _ in range(_REFITS):
-        ghost.refit(template.solid)
+    ghost.refit_anew(template.solid)
     return ghost
 
 

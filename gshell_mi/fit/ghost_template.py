@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..fields.thin_parts import back_on_solid
+from ..lattice import Lattice
 
 #: A template takes its opacity from another one that is at most this many cells away ...
 _REACH = 1.5
@@ -44,29 +45,36 @@ class GhostTemplate:
         return self.logits > 0
 
 
-def ghost_template(subject: mi.Shape, state: Mapping[str, np.ndarray], *,
+def closed_template(subject: mi.Shape, sdf: np.ndarray,
+                    lattice: Lattice) -> tuple[SurfaceMesh, np.ndarray, np.ndarray]:
+    """The template that is where ``sdf`` changes sign, its vertices (V, 3) and its faces (F, 3).
+
+    Args:
+        subject: the gshell shape; it is left with this field, closed, whatever it had before.
+        sdf: at the vertices of ``lattice``.
+        lattice: need not be the shape's own.
+    """
+    subject.set_fields(LatticeFields.closed(sdf, lattice.grid))
+    mesh = subject.template()
+    vertices, faces, _ = mesh.to_numpy()
+    return mesh, vertices, faces
+
+
+def ghost_template(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, *,
                    like: GhostTemplate | None = None) -> GhostTemplate:
     """Extracts a template from lattice fields.
 
     Args:
-        subject: the gshell shape; it is left with these fields.
+        subject: the gshell shape; it is left with these fields, as of ``closed_template``.
+        lattice: of the fields.
         state: ``sdf``, ``hull`` (the sdf before thin parts were grown) and ``msdf``.
         like: a template before a change of shape, whose opacity the new one takes over. New parts are solid.
     """
-    lattice = subject.lattice
-    subject.set_fields(LatticeFields.closed(state["sdf"], lattice.grid))
-    mesh = subject.template()
-    vertices, faces, _ = mesh.to_numpy()
+    mesh, vertices, faces = closed_template(subject, state["sdf"], lattice)
     logits, excess = (mesh.interpolate(mi.Float(state[name])).numpy() for name in ("msdf", "hull"))
     logits = logits / lattice.spacing
-    scale = length_scale(subject.to_world)
     if like is not None:
         distance, nearest = cKDTree(like.vertices).query(vertices)
-        logits = np.where(distance < _REACH * lattice.spacing * scale, like.logits[nearest], _CERTAIN)
-    start = back_on_solid(vertices, faces, np.where(logits > 0, scale * excess, 0))
+        logits = np.where(distance < _REACH * subject.cell_size, like.logits[nearest], _CERTAIN)
+    start = back_on_solid(vertices, faces, np.where(logits > 0, subject.length_scale * excess, 0))
     return GhostTemplate(mesh, vertices, faces, logits, start)
-
-
-def length_scale(to_world: mi.ScalarTransform4f) -> float:
-    """World units per lattice unit: the cube root of the transform's volume ratio."""
-    return float(abs(np.linalg.det(np.array(to_world.matrix)[:3, :3])) ** (1 / 3))

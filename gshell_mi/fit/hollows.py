@@ -19,8 +19,11 @@ _DEPTH, _LEAST = 0.4, 0.03
 #: What it costs to leave outside a vertex that is opaque or not seen.
 _HIDDEN = 0.6
 
-#: A vertex is seen if this fraction of the rays that come near reach it, and opaque from this opacity on.
-_SEEN, _OPAQUE = 0.03, 0.5
+#: A vertex is seen if this fraction of the rays that come near reach it ...
+SEEN = 0.03
+
+#: ... and opaque from this opacity of a cell on.
+_OPAQUE = 0.5
 
 #: Vertices up to this many cells below an opening are inside, at this cost.
 _LID, _LID_COST = 1.6, 20.0
@@ -50,7 +53,7 @@ def hollows(hull: np.ndarray, msdf: np.ndarray, opacity: np.ndarray, seen: np.nd
     """
     inside = hull < 0
     lid = inside & (msdf < 0) & (hull > -_LID)
-    solid = _minimum_cut(inside, lid, opacity, (seen < _SEEN) | (opacity > _OPAQUE))
+    solid = _minimum_cut(inside, lid, opacity, (seen < SEEN) | (opacity > _OPAQUE))
     air = ndimage.binary_opening(~solid, ndimage.generate_binary_structure(3, 1))
     hollow = inside & air
     hollow = ndimage.binary_propagation(hollow & (hull < -_SHALLOW), mask=hollow)

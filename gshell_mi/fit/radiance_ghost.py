@@ -15,6 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 from .. import losses
+from ..activations import inverse_softplus, sigmoid, softplus
+from ..compat import mesh_scene
 from ..fields.smoothing import MeshDiffusion
 from ..views import PinholeViews
 from .config import FitConfig
@@ -36,6 +38,9 @@ _LOGIT_LIMIT = 3.0
 
 #: Steps that adapt the radiance to a given opacity, and steps that then measure the image error.
 _REFIT_STEPS, _ERROR_STEPS = 40, 20
+
+#: Refits of a ghost that has not learnt anything yet.
+_ROUNDS_FROM_GREY = 3
 
 #: Random pixels of these steps must not depend on how many training steps came before.
 _EXTRA_STEP = 1 << 20
@@ -65,11 +70,11 @@ class RadianceGhost:
         self.vertex_count = len(vertices)
         self._positions = mi.Float(vertices.ravel().astype(np.float32))
         self._faces = mi.Vector3u(faces.T.astype(np.uint32))
-        self.scene = _scene(self._positions, dr.ravel(self._faces), self.vertex_count, len(faces))
+        self.scene = mesh_scene(vertices, faces)
         self._offset = 1e-4 * float(np.ptp(vertices, axis=0).max())
         self._smooth = MeshDiffusion(faces, self.vertex_count, config.ghost_smoothing)
         self._tone = Contrast(pixels.mean_radiance())
-        grey = _inverse_softplus(pixels.mean_radiance())
+        grey = inverse_softplus(pixels.mean_radiance())
         self.optimizer = mi.ad.Adam(lr=config.ghost_lr)
         for side in SIDES:
             self.optimizer[side] = dr.full(mi.Float, grey, 3 * self.vertex_count)
@@ -88,8 +93,8 @@ class RadianceGhost:
         mask = losses.mask_l2(alpha, sample.alpha)
         # Where a mask shows daylight within the hull, every sheet on the ray is open: no doubt, no balance.
         daylight = losses.mask_l2(dr.select(sample.alpha < 0.01, alpha, 0), 0)
-        opacity = _sigmoid(optimizer["opacity"])
-        front, back = (dr.unravel(mi.Color3f, _softplus(optimizer[side])) for side in SIDES)
+        opacity = sigmoid(optimizer["opacity"])
+        front, back = (dr.unravel(mi.Color3f, softplus(optimizer[side])) for side in SIDES)
         # Undecided opacity must have its say first; only then is it made to decide.
         late = dr.opaque(mi.Float, max(0.0, 2 * progress - 1))
         total = (
@@ -105,6 +110,11 @@ class RadianceGhost:
         error = dr.mean(dr.ravel(dr.square(dr.detach(radiance) - sample.radiance)))
         return {"loss": total[0], "image": image[0], "mask": mask[0],
                 "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
+
+    def refit_anew(self, opaque: np.ndarray) -> None:
+        """Fits the radiance as ``refit`` does, but from grey to where errors compare."""
+        for _ in range(_ROUNDS_FROM_GREY):
+            self.refit(opaque)
 
     def refit(self, opaque: np.ndarray) -> None:
         """Fits the radiance alone, with the vertices ``opaque`` (V,) opaque and the others open."""
@@ -153,7 +163,7 @@ class RadianceGhost:
         if self.glossy:
             self._normals = self._smooth_normals()
         parameters = mi.traverse(self.scene)
-        parameters["ghost.vertex_positions"] = positions
+        parameters["mesh.vertex_positions"] = positions
         parameters.update()
 
     def _set_opacity(self, logits: np.ndarray) -> None:
@@ -203,7 +213,7 @@ class RadianceGhost:
 
     def radiance(self) -> tuple[np.ndarray, np.ndarray]:
         """(V, 3) front and back radiance."""
-        return tuple(_softplus(self.optimizer[side]).numpy().reshape(-1, 3) for side in ("front", "back"))
+        return tuple(softplus(self.optimizer[side]).numpy().reshape(-1, 3) for side in ("front", "back"))
 
     def preview(self) -> Preview:
         """The part of the mesh that is not clearly fading, in the radiance of its front."""
@@ -245,8 +255,8 @@ class RadianceGhost:
                 logit += weight * dr.gather(mi.Float, opacity, corner, hit)
                 for side, seen in zip(SIDES, (hit & is_front, hit & ~is_front), strict=True):
                     color += weight * dr.gather(mi.Color3f, self.optimizer[side], corner, seen)
-            alpha = dr.select(hit, _sigmoid(logit), 0)
-            color = _softplus(color)
+            alpha = dr.select(hit, sigmoid(logit), 0)
+            color = softplus(color)
             if self.glossy:
                 color += self._mirrored(sheet, direction)
             radiance += transmittance * alpha * color
@@ -270,23 +280,3 @@ class RadianceGhost:
         """(3 V,) unit normals, as smooth as the other values at the vertices."""
         normals = dr.unravel(mi.Vector3f, self._smooth(vertex_normals(self._positions, self._faces)))
         return dr.ravel(normals / dr.maximum(dr.norm(normals), 1e-12))
-
-
-def _scene(positions: mi.Float, faces: mi.UInt32, vertex_count: int, face_count: int) -> mi.Scene:
-    mesh = mi.Mesh("ghost", vertex_count, face_count)
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"], parameters["faces"] = positions, faces
-    parameters.update()
-    return mi.load_dict({"type": "scene", "ghost": mesh})
-
-
-def _sigmoid(x):
-    return dr.rcp(1 + dr.exp(-x))
-
-
-def _softplus(x):
-    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
-
-
-def _inverse_softplus(y: float) -> float:
-    return float(np.log(np.expm1(max(y, 1e-3))))

@@ -14,7 +14,8 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ..conversion.solid_distance import mesh_scene
+from ..activations import sigmoid, softplus
+from ..compat import mesh_scene
 from ..views import PinholeViews
 from .config import FitConfig
 from .contrast import Contrast
@@ -96,7 +97,7 @@ class RadianceVolume:
         dr.backward(image + weight * mask)
         adjoint = *dr.detach((radiance, transmittance)), dr.grad(radiance), dr.grad(transmittance)
         gradient = dr.unravel(mi.Vector4f, self._march(rays, iteration, adjoint=adjoint))
-        slope = self._allowed * dr.rcp(1 + dr.exp(-dr.detach(optimizer["density"])))
+        slope = self._allowed * sigmoid(dr.detach(optimizer["density"]))
         dr.set_grad(optimizer["density"], slope * gradient.w)
         dr.set_grad(optimizer["radiance"], dr.ravel(mi.Vector3f(gradient.x, gradient.y, gradient.z)))
         optimizer.step()
@@ -108,7 +109,7 @@ class RadianceVolume:
 
     def opacity(self) -> np.ndarray:
         """(n + 1, n + 1, n + 1) opacity of one cell's length, in [0, 1]."""
-        depth = _softplus(dr.detach(self.optimizers["volume"]["density"])) * self._allowed
+        depth = softplus(dr.detach(self.optimizers["volume"]["density"])) * self._allowed
         return self._cube(1 - dr.exp(-depth))
 
     def seen(self) -> np.ndarray:
@@ -204,7 +205,7 @@ class RadianceVolume:
         density, radiance = dr.detach(optimizer["density"]), dr.detach(optimizer["radiance"])
         # One packet per vertex is one memory access.
         red, green, blue = dr.unravel(mi.Vector3f, radiance)
-        values = dr.ravel(mi.Vector4f(red, green, blue, _softplus(density) * self._allowed))
+        values = dr.ravel(mi.Vector4f(red, green, blue, softplus(density) * self._allowed))
         gradient = dr.zeros(mi.Float, dr.width(values)) if adjoint else None
         dr.eval(values)
         cells, side = dr.opaque(mi.Float, n), dr.opaque(mi.UInt32, n + 1)
@@ -246,7 +247,3 @@ def _nearby_vertex(position: mi.Point3f, cells: mi.Float, side: mi.UInt32, rando
     x, y, z = (mi.UInt32(dr.clip(dr.floor(coordinate + u), 0, cells))
                for coordinate, u in zip(position, uniform, strict=True))
     return x + side * (y + side * z)
-
-
-def _softplus(x: mi.Float) -> mi.Float:
-    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))

@@ -14,7 +14,8 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from ..conversion.solid_distance import mesh_scene, solid_distance
+from ..compat import mesh_scene
+from ..conversion.solid_distance import solid_distance
 from ..fields import LatticeFields
 from ..fields.smoothing import MeshDiffusion
 from ..topology import Topology, topology

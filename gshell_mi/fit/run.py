@@ -1,4 +1,4 @@
-"""The fit from start to end: hull, ghost, refinement, joint stage, export; with checkpoints in between."""
+"""The fit from start to end, with checkpoints: hull, ghost, carving, refinement, joint stage, export."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ import numpy as np
 from ..errors import UserError
 from ..export import check_output_folder, export_fit, make_output_folder, write_metrics
 from ..export.asset import write_asset
-from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..fields.interpolation import Interpolation
 from ..fields.lattice_fields import closed_at_border
@@ -35,7 +34,7 @@ from .config import FitConfig, default_output
 from .depth import check_depth
 from .field_fitting import FieldFitting
 from .findings import findings
-from .ghost_template import GhostTemplate, ghost_template, length_scale
+from .ghost_template import GhostTemplate, closed_template, ghost_template
 from .interrupt import Interrupt
 from .joint import JointStage
 from .memory import MemoryEstimate
@@ -186,7 +185,7 @@ class _Fit:
             world = visual_hull(points, self.views, [target.rgba[..., 3] for target in self.scene.targets],
                                 daylight_votes=self.config.hull_daylight_votes, progress=advance)
             cell = self.lattice.spacing
-            solid = np.clip(world.numpy() / length_scale(self.scene.subject.to_world), -1, 1) / cell
+            solid = np.clip(world.numpy() / self.scene.subject.length_scale, -1, 1) / cell
             grown = thickened(solid.reshape((samples.stride,) * 3), finer)
             vertices = self.lattice.points(mi.Float)
             sdf, hull = (Interpolation(mi.Float(cell * field.ravel()), samples)(vertices).numpy()
@@ -213,7 +212,7 @@ class _Fit:
     def _ghost(self) -> None:
         """Finds the openings of the template, and its radiance."""
         state = self.checkpoint.arrays
-        template, vertices, faces = self._template(state["sdf"])
+        template, vertices, faces = closed_template(self.scene.subject, state["sdf"], self.lattice)
         ghost = RadianceGhost(vertices, faces, self.views, self.pixels, self.config)
         if not self.config.watertight:
             self._iterate("ghost", self.config.ghost_iterations, ghost, {"ghost": ghost.optimizer}, state)
@@ -246,14 +245,14 @@ class _Fit:
         carved = None
         # The volume lives on a lattice of cubes.
         if count and self.lattice.vertex_count == self.lattice.stride**3:
-            _, vertices, faces = self._template(state["hull"])
+            _, vertices, faces = closed_template(self.scene.subject, state["hull"], self.lattice)
             known, unknown = self._split_pixels()
             volume = RadianceVolume(state["hull"].reshape((self.lattice.stride,) * 3), vertices, faces,
                                     self.scene.subject.to_world, self.views, known, self.config,
                                     self.checkpoint.iteration)
             self._iterate("carving", count, volume, volume.optimizers, state)
             with self.progress.stage("hollows", None), self._timed("carving"):
-                carved = carve(self.scene.subject, state, volume, known, unknown)
+                carved = carve(self.scene.subject, state, self.lattice, volume, known, unknown)
         self.checkpoint.facts["carved"] = carved is not None
         kept = {name: state[name] for name in ("hull", *_SURFACE)}
         self._enter("refinement", **(kept | (carved or {})), light=state["light"])
@@ -261,7 +260,7 @@ class _Fit:
     def _refine(self) -> None:
         """Moves the template inside the hull, and the fields with it."""
         state = self.checkpoint.arrays
-        template = ghost_template(self.scene.subject, state)
+        template = ghost_template(self.scene.subject, state, self.lattice)
         # Without a refinement, what was grown for being thin shrinks back.
         moved, kept = template.start, False
         radiance = template.mesh.interpolate(mi.Float(state["radiance"].ravel()), 3).numpy().T
@@ -283,8 +282,7 @@ class _Fit:
         faces, solid, start = template.faces, template.solid, template.start
         known, unknown = self._split_pixels()
         ghost = RadianceGhost(start, faces, self.views, known, self.config, glossy=True)
-        for _ in range(3):
-            ghost.refit(solid)
+        ghost.refit_anew(solid)
         unexplained = ghost.unexplained(unknown)
         outlines = None
         if self.pixels.has_alpha:
@@ -307,13 +305,6 @@ class _Fit:
         seen = np.setdiff1d(every, held_out) if len(every) > 1 else every
         known, unknown = (PixelPool(self.views, self.scene.targets, chosen) for chosen in (seen, held_out))
         return known, unknown
-
-    def _template(self, sdf: np.ndarray) -> tuple[SurfaceMesh, np.ndarray, np.ndarray]:
-        """The template that is where ``sdf`` changes sign, its vertices and its faces."""
-        self.scene.subject.set_fields(LatticeFields.closed(sdf, self.lattice.grid))
-        template = self.scene.subject.template()
-        vertices, faces, _ = template.to_numpy()
-        return template, vertices, faces
 
     def _joint(self) -> JointStage:
         start = dict(self.checkpoint.arrays)
@@ -369,7 +360,7 @@ class _Fit:
     # --- bookkeeping
 
     def _iterate(self, stage: str, count: int,
-                 worker: RadianceGhost | PhotometricRefinement | FieldFitting | JointStage,
+                 worker: RadianceGhost | RadianceVolume | PhotometricRefinement | FieldFitting | JointStage,
                  optimizers: Mapping[str, mi.ad.Adam], constants: dict[str, np.ndarray],
                  variables: Callable[[], dict[str, np.ndarray]] = dict) -> None:
         """Runs the steps of a stage that are left, logging each and saving a checkpoint now and then."""

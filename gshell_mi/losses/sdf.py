@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..activations import softplus
 from ..block_lattice import BlockLattice
 from ..extraction.surface_mesh import gather
 from ..lattice import Lattice
@@ -73,5 +74,4 @@ def _axis_edges(sdf: mi.Float, lattice: Lattice | BlockLattice):
 
 def _cross_entropy(logit: mi.Float, other: mi.Float) -> mi.Float:
     """Of ``sigmoid(logit)`` against the sign of ``other``, 1 for outside: ``softplus(-+ logit)``."""
-    x = dr.select(other < 0, logit, -logit)
-    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
+    return softplus(dr.select(other < 0, logit, -logit))

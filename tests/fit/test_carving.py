@@ -12,6 +12,7 @@ from gshell_mi.fit.carving import carve
 from gshell_mi.fit.ghost_template import ghost_template
 from gshell_mi.fit.pixels import PixelPool
 from gshell_mi.fit.radiance_volume import RadianceVolume
+from gshell_mi.lattice import make_lattice
 
 RESOLUTION = 32
 CELL = 2 / RESOLUTION
@@ -36,7 +37,7 @@ def trained():
             for step in range(CONFIG.carving_iterations):
                 volume.step(step)
             volumes[shape] = volume, known, unknown
-        return subject, state, carve(subject, state, *volumes[shape])
+        return subject, state, carve(subject, state, subject.lattice, *volumes[shape])
 
     return run
 
@@ -46,7 +47,7 @@ def test_a_cup_is_found(trained):
     sdf = carved["sdf"].reshape((RESOLUTION + 1,) * 3)
     centre, half_depth = RESOLUTION // 2, round(0.5 * HALF / CELL)
     assert sdf[centre, centre + half_depth, centre] > 0 > sdf[centre, centre - half_depth, centre]
-    found = ghost_template(subject, carved)
+    found = ghost_template(subject, carved, subject.lattice)
     inner = np.abs(found.start).max(axis=1) < HALF - 0.25 * CELL
     truth, _ = trimesh.sample.sample_surface(cup(), 40000, seed=1)
     distance = cKDTree(truth).query(found.start[inner])[0]
@@ -69,9 +70,21 @@ def test_new_parts_are_solid_and_old_ones_keep_their_opacity():
     field = hull.ravel().astype(np.float32)
     z = np.repeat(np.linspace(-1, 1, RESOLUTION + 1), (RESOLUTION + 1) ** 2).astype(np.float32)
     state = {"sdf": field, "hull": field, "msdf": z * CELL}
-    before = ghost_template(subject, state)
+    before = ghost_template(subject, state, subject.lattice)
     hole = 0.3 - np.linalg.norm(subject.lattice.vertex_positions(), axis=1)
-    after = ghost_template(subject, state | {"sdf": np.maximum(field, hole).astype(np.float32)}, like=before)
+    carved = state | {"sdf": np.maximum(field, hole).astype(np.float32)}
+    after = ghost_template(subject, carved, subject.lattice, like=before)
     inner = np.abs(after.vertices).max(axis=1) < 0.45
     assert inner.any() and after.solid[inner].all()
     np.testing.assert_array_equal(after.solid[~inner], after.vertices[~inner, 2] > 0)
+
+
+def test_the_shape_may_have_had_another_lattice():
+    """As that of a fit with --grid or --resolution has that is resumed: it comes from the scene's file."""
+    subject = mi.load_dict({"type": "gshell", "resolution": 12})
+    lattice = make_lattice("cube", RESOLUTION)
+    field = hull_of(RESOLUTION)[0].ravel().astype(np.float32)
+    state = {"sdf": field, "hull": field, "msdf": np.full_like(field, 2 * CELL)}
+    found = ghost_template(subject, state, lattice)
+    assert subject.lattice == lattice
+    np.testing.assert_allclose(found.logits, 2, rtol=1e-5)
