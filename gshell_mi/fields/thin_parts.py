@@ -15,7 +15,7 @@ from scipy import ndimage
 _RADIUS = 0.5
 
 #: Half the thickness, in cells, that a lattice never misses.
-_HALF = 0.55
+_HALF = 0.8
 
 #: The solid is sampled up to this many times finer than the lattice ...
 _REFINEMENT = 3

@@ -17,7 +17,6 @@ import numpy as np
 from ..errors import UserError
 from ..export import check_output_folder, export_fit, make_output_folder, write_metrics
 from ..export.asset import write_asset
-from ..fields import LatticeFields
 from ..fields.interpolation import Interpolation
 from ..fields.lattice_fields import closed_at_border
 from ..fields.thin_parts import thickened, thin_part_refinement
@@ -27,6 +26,7 @@ from ..lattice import CubeLattice, make_lattice
 from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
 from ..scene import load_fit_scene
+from ..topology import topology
 from ..views import PinholeViews
 from .carving import carve
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
@@ -47,6 +47,7 @@ from .radiance_ghost import RadianceGhost
 from .radiance_volume import RadianceVolume
 from .recast import recast
 from .refinement import PhotometricRefinement
+from .spare_sides import Cut, without_spare_sides
 from .start import TYPICAL_REFLECTANCE, block_arrays, check_given, start_fields, start_light, start_material
 
 #: What the joint stage starts from.
@@ -212,8 +213,10 @@ class _Fit:
     def _ghost(self) -> None:
         """Finds the openings of the template, and its radiance."""
         state = self.checkpoint.arrays
-        template, vertices, faces = closed_template(self.scene.subject, state["sdf"], self.lattice)
-        ghost = RadianceGhost(vertices, faces, self.views, self.pixels, self.config)
+        closed = dict(state) | {"msdf": np.ones_like(state["sdf"])}
+        template = ghost_template(self.scene.subject, closed, self.lattice)
+        vertices, faces = template.vertices, template.faces
+        ghost = RadianceGhost(template.start, faces, self.views, self.pixels, self.config)
         if not self.config.watertight:
             self._iterate("ghost", self.config.ghost_iterations, ghost, {"ghost": ghost.optimizer}, state)
         with self.progress.stage("openings", None), self._timed("ghost"):
@@ -226,8 +229,8 @@ class _Fit:
             raise UserError(f"The radiance ghost found nothing opaque in '{self.scene.path}'; give it more "
                             f"steps with --ghost-iterations, or check the cameras.")
         front, _ = ghost.radiance()
-        msdf = msdf_from_template(logits, template, self.lattice)
-        radiance, known = splat_to_lattice(mi.Float(front.ravel()), template, self.lattice)
+        msdf = msdf_from_template(logits, template.mesh, self.lattice)
+        radiance, known = splat_to_lattice(mi.Float(front.ravel()), template.mesh, self.lattice)
         light = float(np.median(front[~opened].mean(axis=1)))
         radiance = radiance.numpy().reshape(-1, 3)
         self._enter("carving", sdf=state["sdf"], hull=state["hull"], msdf=msdf.numpy(), radiance=radiance,
@@ -269,12 +272,22 @@ class _Fit:
         fields = None
         if (moved != template.vertices).any():
             with self._timed("refinement"):
-                before = LatticeFields.closed(state["sdf"], self.lattice.grid)
-                self.scene.subject.set_fields(dataclasses.replace(before, msdf=state["msdf"]))
-                fields = recast(self.scene.subject, template.vertices, moved, template.faces, template.logits,
-                                radiance, self.config.ghost_min_area)
+                for cut in self._cuts(template, moved):
+                    fields = recast(self.scene.subject, template.vertices, cut.positions, template.faces,
+                                    cut.logits, radiance, self.config.ghost_min_area, cut.topology)
+                    if fields:
+                        break
         self.checkpoint.facts["refinement_kept"] = kept and fields is not None
         self._enter("joint", **(fields or {name: state[name] for name in _SURFACE}), light=state["light"])
+
+    def _cuts(self, template: GhostTemplate, moved: np.ndarray) -> list[Cut]:
+        """How to cut a moved template, the best first."""
+        found = topology(template.vertices, template.faces[template.solid[template.faces].all(axis=1)])
+        as_found = Cut(template.logits, moved, found)
+        if self.config.watertight:
+            return [as_found]
+        cut = without_spare_sides(as_found, template.vertices, template.faces, self.scene.subject.cell_size)
+        return [cut, as_found] if cut else [as_found]
 
     def _refined(self, template: GhostTemplate,
                  state: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, bool]:

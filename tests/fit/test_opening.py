@@ -1,5 +1,6 @@
 """Cutting a template open: which cuts are kept, and where the rim comes to lie."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -141,3 +142,24 @@ def test_specks_go_and_openings_stay():
     assert vertices[:, 1].max() == pytest.approx(0.3, abs=1e-4)
     far = (np.abs(cut) > 0.3) & (np.abs(island) > 0.3)
     np.testing.assert_array_equal(cleaned.numpy()[far], msdf.numpy()[far])
+
+
+def test_a_speck_in_a_thin_part_goes_and_leaves_the_other_side_open():
+    """Both sides of a plate of 1.2 cells share the lattice vertices between them."""
+    lattice = TetLattice(24)
+    points, cell = lattice.vertex_positions(), lattice.spacing
+    sdf = np.maximum(np.abs(points[:, 2]) - 0.6 * cell, np.hypot(points[:, 0], points[:, 1]) - 0.7)
+    sdf, still = mi.Float(sdf.astype(np.float32)), mi.Float(np.zeros(points.size, np.float32))
+    solid = dr.full(mi.Float, 1, lattice.vertex_count)
+    template = extract(lattice, sdf, solid, still, template=True).template
+    vertices = template.to_numpy()[0]
+    upper = vertices[:, 2] > 0
+    specks = np.linalg.norm(vertices[:, None] - [[0.1, 0.1, 0.6 * cell], [-0.3, 0.2, 0.6 * cell]],
+                            axis=2).min(axis=1) < 0.8 * cell
+    msdf = msdf_from_template(np.where(upper & ~specks, 1.0, -1.0), template, lattice)
+    assert loop_count(extract(lattice, sdf, msdf, still).to_numpy()[1]) > 1
+    cleaned = without_specks(msdf, template, lattice, 0.02)
+    assert loop_count(extract(lattice, sdf, cleaned, still).to_numpy()[1]) == 1
+    found = template.interpolate(cleaned).numpy() > 0
+    within = np.hypot(vertices[:, 0], vertices[:, 1]) < 0.7 - 2 * cell
+    assert found[within & upper].all() and not found[within & ~upper].any()

@@ -7,7 +7,7 @@ import trimesh
 
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit.recast import recast, thickened
-from gshell_mi.topology import topology
+from gshell_mi.topology import Topology, topology
 
 RESOLUTION = 32
 CELL = 2 / RESOLUTION
@@ -30,9 +30,9 @@ def surface(subject, fields) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def cut(subject, msdf) -> None:
-    fields = subject.fields()
-    subject.set_fields(LatticeFields(fields.sdf, msdf, fields.deform))
+def counts(loops: int) -> Topology:
+    return Topology(vertices=0, faces=0, components=1, boundary_loops=loops, pinholes=0, boundary_length=0.0,
+                    nonmanifold_edges=0)
 
 
 def solid(vertices) -> np.ndarray:
@@ -45,7 +45,8 @@ def test_a_sphere_that_grew(mirror):
     subject, vertices, faces = sphere(mi.ScalarTransform4f().translate([5, 0, 0]).scale(scale))
     centre = np.array([5.0, 0, 0])
     moved = centre + 1.2 * (vertices - centre)
-    fields = recast(subject, vertices, moved, faces, solid(vertices), np.abs(vertices - centre), 0.005)
+    fields = recast(subject, vertices, moved, faces, solid(vertices), np.abs(vertices - centre), 0.005,
+                    counts(0))
     found = surface(subject, fields)
     radius = np.linalg.norm(found.vertices - centre, axis=1)
     np.testing.assert_allclose(radius, 1.44, atol=0.08 * 2 * CELL)
@@ -60,12 +61,11 @@ def test_a_sphere_that_grew(mirror):
 def test_the_opening_moves_along():
     subject, vertices, faces = sphere()
     logits = (0.2 - vertices[:, 1]) / CELL
-    cut(subject, 0.2 - subject.lattice.vertex_positions()[:, 1])
     fields = recast(subject, vertices, vertices * [1, 1.25, 1], faces, logits, np.ones((len(vertices), 3)),
-                    0.005)
+                    0.005, counts(1))
     found = surface(subject, fields)
-    counts = topology(found.vertices, found.faces)
-    assert (counts.boundary_loops, counts.pinholes, counts.components) == (1, 0, 1)
+    after = topology(found.vertices, found.faces)
+    assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
     assert found.vertices[:, 1].max() == pytest.approx(0.25, abs=0.2 * CELL)
     assert found.vertices[:, 1].min() == pytest.approx(-0.75, abs=0.1 * CELL)
 
@@ -80,21 +80,20 @@ def test_a_sheet_stays_whole_and_in_its_place():
     vertices[:, 2] += top - CELL / 6
     logits = np.where(vertices[:, 2] > top - 0.1 * CELL, 0.5 - np.hypot(*vertices[:, :2].T), -1) / CELL
     subject, *_ = sphere()
-    cut(subject, subject.lattice.vertex_positions()[:, 1])    # one loop is wanted
-    fields = recast(subject, vertices, vertices, faces, logits, np.ones((len(vertices), 3)), 0.005)
+    fields = recast(subject, vertices, vertices, faces, logits, np.ones((len(vertices), 3)), 0.005, counts(1))
     found = surface(subject, fields)
-    counts = topology(found.vertices, found.faces)
-    assert (counts.boundary_loops, counts.pinholes, counts.components) == (1, 0, 1)
+    after = topology(found.vertices, found.faces)
+    assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
     error = np.abs(found.vertices[:, 2] - top) / CELL
     within = np.hypot(found.vertices[:, 0], found.vertices[:, 1]) < 0.4
-    assert error[within].max() < 1e-3 and error.max() < 0.2
-    assert counts.boundary_length == pytest.approx(np.pi, rel=0.05)
+    assert error[within].max() < 1e-3 and error.max() < 0.25
+    assert after.boundary_length == pytest.approx(np.pi, rel=0.05)
 
 
 def test_a_collapse_goes_only_as_far_as_the_surface_lasts():
     subject, vertices, faces = sphere()
     fields = recast(subject, vertices, np.zeros_like(vertices), faces, solid(vertices),
-                    np.ones((len(vertices), 3)), 0.005)
+                    np.ones((len(vertices), 3)), 0.005, counts(0))
     radius = np.linalg.norm(surface(subject, fields).vertices, axis=1)
     np.testing.assert_allclose(radius, 0.3 * 0.6, atol=0.1 * CELL)
 
@@ -105,7 +104,21 @@ def test_only_the_open_side_gives_way():
         plate = plate.subdivide()
     vertices, faces = np.array(plate.vertices), np.array(plate.faces)
     upper = vertices[:, 2] > -0.2 * CELL
-    moved = thickened(vertices, faces, upper, CELL)
+    moved = thickened(vertices, vertices, faces, upper, CELL)
     middle = (np.abs(vertices[:, :2]) < 0.4).all(axis=1)
     np.testing.assert_array_equal(moved[middle & upper], vertices[middle & upper])
-    np.testing.assert_allclose(moved[middle & ~upper, 2], (0.25 - 1.2) * CELL, atol=0.1 * CELL)
+    np.testing.assert_allclose(moved[middle & ~upper, 2], (0.25 - 1.8) * CELL, atol=0.1 * CELL)
+
+
+def test_sides_that_moved_through_each_other_come_apart():
+    plate = trimesh.creation.box(extents=[1, 1, 0.5 * CELL])
+    for _ in range(5):
+        plate = plate.subdivide()
+    vertices, faces = np.array(plate.vertices), np.array(plate.faces)
+    upper, middle = vertices[:, 2] > 0, (np.abs(vertices[:, :2]) < 0.4).all(axis=1)
+    moved = np.where(middle[:, None], vertices * [1, 1, -1], vertices)
+    apart = thickened(vertices, moved, faces, np.full(len(vertices), True), CELL)
+    inner = (np.abs(vertices[:, :2]) < 0.25).all(axis=1)
+    # Both sides are surface: 0.9 cells apart, and neither has moved more than the other.
+    np.testing.assert_allclose(apart[inner & upper, 2], 0.45 * CELL, atol=0.15 * CELL)
+    np.testing.assert_allclose(apart[inner & ~upper, 2], -0.45 * CELL, atol=0.15 * CELL)

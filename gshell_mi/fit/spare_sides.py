@@ -1,0 +1,199 @@
+"""Sides of sheets that a template can do without: where both are surface, one is enough.
+
+A hull has two sides where the object is one sheet. Both sides of a brim are seen, and neither disagrees with
+the images. But a lattice holds nothing thinner than a cell, so both would have to stay apart by that much.
+Beside an opening, or where the whole object is a sheet, a template that leaves one side out is right, and the
+side that stays can be where the sheet is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from ..fields.smoothing import MeshDiffusion
+from ..topology import Topology, vertex_components
+from .template_sides import normals_at_vertices, opposite_sides
+
+#: Parts are thin up to this thickness, in cells.
+_THIN = 1.2
+
+#: Least cosine with which sides of a sheet face away from each other, and neighbours on a side the same way.
+_FLAT = 0.8
+
+#: What is cut off and smaller than this fraction of what it was part of goes.
+_CUT_OFF = 0.1
+
+#: Where there is no opening, a part is a sheet if one side of it is this fraction of it ...
+_SHEET_SHARE = 0.35
+
+#: ... and the median thickness of its thin parts is less than this, in cells.
+_SHEET_THICKNESS = 0.5
+
+#: Lambda that smooths the new rims along the mesh, and how spare sides are carried along.
+_SMOOTHING = 3.0
+
+#: A ridge is up to twice this many vertices wide.
+_RIDGE = 3
+
+#: Rounds of smoothing and balancing.
+_BALANCINGS = 10
+
+#: Share of spare vertices around a vertex from which on its logit is new.
+_NEAR = 0.01
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A template, and how it is to be cut.
+
+    Attributes:
+        logits: (V,) surface where positive, open elsewhere.
+        positions: (V, 3) of the vertices, world units.
+        topology: of what stays.
+    """
+
+    logits: np.ndarray
+    positions: np.ndarray
+    topology: Topology
+
+
+def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: float) -> Cut | None:
+    """A moved template without the sides that it can do without; None if there are none.
+
+    Args:
+        cut: the template with them.
+        before: (V, 3) positions before it moved, when it was nowhere too thin for the lattice.
+        faces: (F, 3) of the watertight template, oriented outwards.
+        cell: side of a lattice cell, in the positions' unit.
+    """
+    solid = cut.logits > 0
+    sides = opposite_sides(before, cut.positions, faces, cell)
+    spare, sheets = spare_sides(*sides, normals_at_vertices(before, faces), faces, solid, cell)
+    if not spare.any():
+        return None
+    smooth = MeshDiffusion(faces, len(solid), _SMOOTHING)
+    signs = smooth(mi.Float(np.where(spare | ~solid, -1, 1).astype(np.float32))).numpy()
+    near = smooth(mi.Float(spare.astype(np.float32))).numpy() > _NEAR
+    thickness, opposite = opposite_sides(before, before, faces, cell)
+    opposite = np.where(np.isfinite(thickness), opposite, -1)
+    return Cut(np.where(near, signs, cut.logits), carried(before, cut.positions, spare, opposite, smooth),
+               dataclasses.replace(cut.topology, boundary_loops=cut.topology.boundary_loops + sheets))
+
+
+def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray, faces: np.ndarray,
+                solid: np.ndarray, cell: float) -> tuple[np.ndarray, int]:
+    """Sides of thin parts that may go: those beside openings, and one of a part that is nothing but a sheet.
+
+    Args:
+        thickness: (V,) of the template under each vertex; infinite where there is no other side.
+        opposite: (V,) vertex on the other side.
+        normals: (V, 3) of the template before it moved.
+        faces: (F, 3) of the template.
+        solid: (V,) False where the template is open.
+        cell: side of a lattice cell, in the unit of ``thickness``.
+
+    Returns:
+        (V,) whether a vertex may be opened too, and how many parts without an opening are sheets.
+    """
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    facing_away = np.einsum("nj,nj->n", normals, normals[opposite]) < -_FLAT
+    thin = solid & solid[opposite] & (thickness < _THIN * cell) & facing_away
+    part = vertex_components(edges, len(solid))[1]
+    closed = (np.bincount(part, ~solid) == 0)[part]
+    candidates = np.flatnonzero(thin & closed)
+    seed = np.isin(np.arange(len(solid)), candidates) & _one_side(thin, normals, edges, part)
+    opened = _grown(~solid | seed, thin, opposite, edges)
+    opened |= _cut_off(opened, solid, edges)
+    spare = solid & (_balanced(opened, thin, opposite, faces, edges) < 0)
+    # A fin of something solid is no sheet, nor is a plate, whose sides stay apart.
+    share = np.bincount(part, spare) / np.maximum(np.bincount(part, solid), 1)
+    sheets = [index for index in np.unique(part[candidates]) if share[index] > _SHEET_SHARE
+              and np.median(thickness[candidates[part[candidates] == index]]) < _SHEET_THICKNESS * cell]
+    return spare & (~closed | np.isin(part, sheets)), len(sheets)
+
+
+def _one_side(thin: np.ndarray, normals: np.ndarray, edges: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """(V,) of the thin vertices of each part the largest patch without a ridge."""
+    start, end = edges.T
+    flat = thin[start] & thin[end] & (np.einsum("nj,nj->n", normals[start], normals[end]) > _FLAT)
+    patch = vertex_components(edges[flat], len(thin))[1]
+    size = np.bincount(patch, thin)
+    largest = np.zeros(len(thin))
+    np.maximum.at(largest, part, size[patch])
+    # Of patches of one size, the first.
+    chosen = np.flatnonzero(thin & (size[patch] == largest[part]))
+    first = patch[chosen[np.unique(part[chosen], return_index=True)[1]]]
+    return thin & np.isin(patch, first)
+
+
+def _grown(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """(V,) openings grown over thin parts, as far as the other side stays, and over the ridges beyond."""
+    needed, start = np.zeros(len(opened), bool), opened
+    needed[opposite[opened & thin]] = True
+    while True:
+        front = _beside(opened, edges) & thin & ~opened[opposite] & ~needed
+        # Of two sides that are reached at once one stays.
+        front &= ~(front[opposite] & (opposite < np.arange(len(opened))))
+        if not front.any():
+            break
+        opened = opened | front
+        needed[opposite[front]] = True
+    # Where a sheet ends its sides meet in a ridge, which has no other side.
+    return opened | _beside(opened & ~start, edges) & ~needed & ~(thin & opened[opposite])
+
+
+def _cut_off(opened: np.ndarray, solid: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """(V,) small pieces of what was ``solid`` that hang in the opening now."""
+    patch = vertex_components(edges[~opened[edges].any(axis=1)], len(solid))[1]
+    whole = vertex_components(edges[solid[edges].all(axis=1)], len(solid))[1]
+    size, largest = np.bincount(patch, ~opened), np.zeros(len(solid))
+    np.maximum.at(largest, whole, size[patch])
+    return ~opened & (size[patch] < _CUT_OFF * largest[whole])
+
+
+def _balanced(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, faces: np.ndarray,
+              edges: np.ndarray) -> np.ndarray:
+    """(V,) negative where open: smooth along the mesh, of opposite sign on the two sides of thin parts."""
+    smooth = MeshDiffusion(faces, len(opened), _SMOOTHING)
+    signs = np.where(opened, -1.0, 1.0)
+    free = thin
+    for _ in range(_RIDGE):
+        free = free | _beside(free, edges)
+    result = signs
+    for _ in range(_BALANCINGS):
+        result = smooth(mi.Float(result.astype(np.float32))).numpy()
+        result = np.where(thin, 0.5 * (result - result[opposite]), result)
+        result = np.where(free, result / max(np.abs(result).max(), 1e-6), signs)
+    return result
+
+
+def carried(before: np.ndarray, moved: np.ndarray, spare: np.ndarray, opposite: np.ndarray,
+            smooth: MeshDiffusion) -> np.ndarray:
+    """(V, 3) positions in which spare sides go where the sides that stay go.
+
+    Alone they would end up in the other side or beyond: nothing keeps what the images hardly tell apart.
+
+    Args:
+        before, moved: (V, 3) positions.
+        spare: (V,) vertices that are open now.
+        opposite: (V,) vertex on the other side; negative if there is none.
+        smooth: spreads values to vertices that have no other side.
+    """
+    known = ~spare | (opposite >= 0) & ~spare[opposite]
+    movement = np.where(spare[:, None], moved[opposite] - before[opposite], moved - before)
+    movement[~known] = 0
+    columns = [smooth(mi.Float(column.astype(np.float32))).numpy() for column in (known, *movement.T)]
+    spread = np.stack(columns[1:], axis=1) / np.maximum(columns[0], 1e-6)[:, None]
+    return np.where(spare[:, None], before + spread, moved)
+
+
+def _beside(chosen: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """(V,) whether a vertex is none of the chosen (V,) but has one as a neighbour."""
+    result = np.zeros(len(chosen), bool)
+    for here, there in (edges.T, edges[:, ::-1].T):
+        result[here[chosen[there]]] = True
+    return result & ~chosen
