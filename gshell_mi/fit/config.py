@@ -100,7 +100,7 @@ class FitConfig:
     """Adam's step for the radiance, as a fraction of the targets' mean."""
 
     # --- photometric refinement: moves the surface inside the hull
-    refinement_iterations: int = 160
+    refinement_iterations: int = 320
     """Steps of the photometric refinement; 0 keeps the hull's shape."""
     refinement_lr: float = 0.15
     """Largest movement of a vertex per step, in cells; falls to 0 like a cosine."""
@@ -117,11 +117,15 @@ class FitConfig:
     """The refinement is kept if it brings the image error of views that it did not see below this fraction.
     Where radiance depends much on the view (gloss), it may explain the views it sees by a wrong shape."""
 
+    sheet_thickness: float = 0.5
+    """What closed parts are at most thick, in cells, to come out as a single open sheet; 0 keeps both sides of
+    every sheet, beside openings too."""
+
     # --- joint stage: geometry, material and light by path tracing
     field: Literal["explicit", "multiresolution", "hashgrid", "sinusoidal"] = "explicit"
     """What the geometry is optimised as: the lattice's values themselves, sums of grids of several
     resolutions, a hash grid with a small network, or a sinusoidal network."""
-    iterations: int = 300
+    iterations: int = 260
     """Steps of the joint stage."""
     warmup: float = 0.15
     """Fraction of these steps in which only material and light move."""

@@ -284,9 +284,10 @@ class _Fit:
         """How to cut a moved template, the best first."""
         found = topology(template.vertices, template.faces[template.solid[template.faces].all(axis=1)])
         as_found = Cut(template.logits, moved, found)
-        if self.config.watertight:
+        if self.config.watertight or not self.config.sheet_thickness:
             return [as_found]
-        cut = without_spare_sides(as_found, template.vertices, template.faces, self.scene.subject.cell_size)
+        cut = without_spare_sides(as_found, template.vertices, template.faces, self.scene.subject.cell_size,
+                                  self.config.sheet_thickness)
         return [cut, as_found] if cut else [as_found]
 
     def _refined(self, template: GhostTemplate,

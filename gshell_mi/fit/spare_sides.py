@@ -27,11 +27,8 @@ _FLAT = 0.8
 #: What is cut off and smaller than this fraction of what it was part of goes.
 _CUT_OFF = 0.1
 
-#: Where there is no opening, a part is a sheet if one side of it is this fraction of it ...
+#: Where there is no opening, a part is a sheet only if one side of it is this fraction of it.
 _SHEET_SHARE = 0.35
-
-#: ... and the median thickness of its thin parts is less than this, in cells.
-_SHEET_THICKNESS = 0.5
 
 #: Lambda that smooths the new rims along the mesh, and how spare sides are carried along.
 _SMOOTHING = 3.0
@@ -61,7 +58,8 @@ class Cut:
     topology: Topology
 
 
-def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: float) -> Cut | None:
+def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: float,
+                        sheet_thickness: float) -> Cut | None:
     """A moved template without the sides that it can do without; None if there are none.
 
     Args:
@@ -69,10 +67,11 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
         before: (V, 3) positions before it moved, when it was nowhere too thin for the lattice.
         faces: (F, 3) of the watertight template, oriented outwards.
         cell: side of a lattice cell, in the positions' unit.
+        sheet_thickness: median thickness, in cells, up to which a part without an opening is a sheet.
     """
     solid = cut.logits > 0
     sides = opposite_sides(before, cut.positions, faces, cell)
-    spare, sheets = spare_sides(*sides, normals_at_vertices(before, faces), faces, solid, cell)
+    spare, sheets = spare_sides(*sides, normals_at_vertices(before, faces), faces, solid, cell, sheet_thickness)
     if not spare.any():
         return None
     smooth = MeshDiffusion(faces, len(solid), _SMOOTHING)
@@ -85,7 +84,7 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
 
 
 def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray, faces: np.ndarray,
-                solid: np.ndarray, cell: float) -> tuple[np.ndarray, int]:
+                solid: np.ndarray, cell: float, sheet_thickness: float) -> tuple[np.ndarray, int]:
     """Sides of thin parts that may go: those beside openings, and one of a part that is nothing but a sheet.
 
     Args:
@@ -95,6 +94,7 @@ def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray
         faces: (F, 3) of the template.
         solid: (V,) False where the template is open.
         cell: side of a lattice cell, in the unit of ``thickness``.
+        sheet_thickness: median thickness, in cells, up to which a part without an opening is a sheet.
 
     Returns:
         (V,) whether a vertex may be opened too, and how many parts without an opening are sheets.
@@ -112,7 +112,7 @@ def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray
     # A fin of something solid is no sheet, nor is a plate, whose sides stay apart.
     share = np.bincount(part, spare) / np.maximum(np.bincount(part, solid), 1)
     sheets = [index for index in np.unique(part[candidates]) if share[index] > _SHEET_SHARE
-              and np.median(thickness[candidates[part[candidates] == index]]) < _SHEET_THICKNESS * cell]
+              and np.median(thickness[candidates[part[candidates] == index]]) < sheet_thickness * cell]
     return spare & (~closed | np.isin(part, sheets)), len(sheets)
 
 

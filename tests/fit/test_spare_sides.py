@@ -42,7 +42,7 @@ def flattened(vertices: np.ndarray, thickness: float) -> np.ndarray:
 
 def cut(vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> Cut | None:
     found = topology(vertices, faces[solid[faces].all(axis=1)])
-    return without_spare_sides(Cut(np.where(solid, 3.0, -3.0), moved, found), vertices, faces, CELL)
+    return without_spare_sides(Cut(np.where(solid, 3.0, -3.0), moved, found), vertices, faces, CELL, 0.5)
 
 
 @pytest.mark.parametrize("thickness", [0.2, -0.2])
