@@ -118,8 +118,8 @@ class FitConfig:
     Where radiance depends much on the view (gloss), it may explain the views it sees by a wrong shape."""
 
     sheet_thickness: float = 0.5
-    """What closed parts are at most thick, in cells, to come out as a single open sheet; 0 keeps both sides of
-    every sheet, beside openings too."""
+    """Closed parts that are at most so thick, in cells, come out as a single open sheet; 0 keeps both sides
+    of every sheet, beside openings too."""
 
     # --- joint stage: geometry, material and light by path tracing
     field: Literal["explicit", "multiresolution", "hashgrid", "sinusoidal"] = "explicit"

@@ -70,8 +70,9 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
         sheet_thickness: median thickness, in cells, up to which a part without an opening is a sheet.
     """
     solid = cut.logits > 0
-    sides = opposite_sides(before, cut.positions, faces, cell)
-    spare, sheets = spare_sides(*sides, normals_at_vertices(before, faces), faces, solid, cell, sheet_thickness)
+    thickness, opposite = opposite_sides(before, cut.positions, faces, cell)
+    normals = normals_at_vertices(before, faces)
+    spare, sheets = spare_sides(thickness, opposite, normals, faces, solid, cell, sheet_thickness)
     if not spare.any():
         return None
     smooth = MeshDiffusion(faces, len(solid), _SMOOTHING)
