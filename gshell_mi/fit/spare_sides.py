@@ -71,11 +71,10 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
     """
     solid = cut.logits > 0
     thickness, opposite = opposite_sides(before, cut.positions, faces, cell)
-    normals = normals_at_vertices(before, faces)
-    spare, sheets = spare_sides(thickness, opposite, normals, faces, solid, cell, sheet_thickness)
+    normals, smooth = normals_at_vertices(before, faces), MeshDiffusion(faces, len(solid), _SMOOTHING)
+    spare, sheets = spare_sides(thickness, opposite, normals, faces, solid, smooth, cell, sheet_thickness)
     if not spare.any():
         return None
-    smooth = MeshDiffusion(faces, len(solid), _SMOOTHING)
     signs = smooth(mi.Float(np.where(spare | ~solid, -1, 1).astype(np.float32))).numpy()
     near = smooth(mi.Float(spare.astype(np.float32))).numpy() > _NEAR
     thickness, opposite = opposite_sides(before, before, faces, cell)
@@ -85,7 +84,8 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
 
 
 def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray, faces: np.ndarray,
-                solid: np.ndarray, cell: float, sheet_thickness: float) -> tuple[np.ndarray, int]:
+                solid: np.ndarray, smooth: MeshDiffusion, cell: float,
+                sheet_thickness: float) -> tuple[np.ndarray, int]:
     """Sides of thin parts that may go: those beside openings, and one of a part that is nothing but a sheet.
 
     Args:
@@ -94,6 +94,7 @@ def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray
         normals: (V, 3) of the template before it moved.
         faces: (F, 3) of the template.
         solid: (V,) False where the template is open.
+        smooth: along the mesh.
         cell: side of a lattice cell, in the unit of ``thickness``.
         sheet_thickness: median thickness, in cells, up to which a part without an opening is a sheet.
 
@@ -106,10 +107,9 @@ def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray
     part = vertex_components(edges, len(solid))[1]
     closed = (np.bincount(part, ~solid) == 0)[part]
     candidates = np.flatnonzero(thin & closed)
-    seed = np.isin(np.arange(len(solid)), candidates) & _one_side(thin, normals, edges, part)
-    opened = _grown(~solid | seed, thin, opposite, edges)
+    opened = _grown(~solid | closed & _one_side(thin, normals, edges, part), thin, opposite, edges)
     opened |= _cut_off(opened, solid, edges)
-    spare = solid & (_balanced(opened, thin, opposite, faces, edges) < 0)
+    spare = solid & (_balanced(opened, thin, opposite, edges, smooth) < 0)
     # A fin of something solid is no sheet, nor is a plate, whose sides stay apart.
     share = np.bincount(part, spare) / np.maximum(np.bincount(part, solid), 1)
     sheets = [index for index in np.unique(part[candidates]) if share[index] > _SHEET_SHARE
@@ -156,10 +156,9 @@ def _cut_off(opened: np.ndarray, solid: np.ndarray, edges: np.ndarray) -> np.nda
     return ~opened & (size[patch] < _CUT_OFF * largest[whole])
 
 
-def _balanced(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, faces: np.ndarray,
-              edges: np.ndarray) -> np.ndarray:
+def _balanced(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges: np.ndarray,
+              smooth: MeshDiffusion) -> np.ndarray:
     """(V,) negative where open: smooth along the mesh, of opposite sign on the two sides of thin parts."""
-    smooth = MeshDiffusion(faces, len(opened), _SMOOTHING)
     signs = np.where(opened, -1.0, 1.0)
     free = thin
     for _ in range(_RIDGE):

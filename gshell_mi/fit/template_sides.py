@@ -40,7 +40,7 @@ def opposite_sides(before: np.ndarray, moved: np.ndarray, faces: np.ndarray,
 
 
 def cast(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray,
-          reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+         reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Face, barycentric weights (0 without a hit) and distance (infinite then) of rays on a mesh."""
     o, d = (np.ascontiguousarray(x.T, np.float32) for x in (origins, directions))
     ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d), reach, 0, [])
