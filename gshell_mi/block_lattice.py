@@ -10,7 +10,7 @@ import drjit as dr
 
 from .errors import UserError
 from .lattice import Lattice
-from .sign_scan import MISSING, active_cells, pack_signs, sign_changes
+from .sign_scan import MISSING, active_cells, closed_signs, pack_signs, sign_changes
 
 #: Cells per block along x, y, z. A row of a block has as many vertices as a machine word has bits.
 BLOCK = (32, 4, 4)
@@ -131,7 +131,7 @@ class BlockLattice:
             word = dr.arange(uint_t, dr.width(words)) + dr.opaque(uint_t, start // 32)
             dr.scatter(inside, words, word, mode=dr.ReduceMode.Permute)
             dr.eval(inside)
-        cells = sign_changes(inside, lattice)
+        cells = sign_changes(closed_signs(inside, lattice), lattice)
         return cls(lattice, _blocks_near(lattice, cells), lambda blocks: sdf(blocks.points(float_t)))
 
     # What a lattice has -------------------------------------------------------------------------------

@@ -75,6 +75,9 @@ class Lattice:
     fits_in_blocks: ClassVar[bool] = True
     """Whether its fields can be stored in blocks, see ``BlockLattice``."""
 
+    closes_at_border: ClassVar[bool] = False
+    """Whether the vertices on its border count as outside."""
+
     @property
     def weight_count(self) -> int:
         """Values of the field ``weights``, which only FlexiCubes have."""
@@ -218,6 +221,7 @@ class FlexiCubesLattice(Lattice):
     """
 
     grid: ClassVar[str] = "flexicubes"
+    closes_at_border: ClassVar[bool] = True
 
     @property
     def weight_count(self) -> int:

@@ -32,29 +32,21 @@ def expand(bits: Any, log2_slots: int) -> tuple[Any, Any]:
     return lane >> log2_slots, lane & mask
 
 
-def active_cells(s: Any, lattice: Lattice | BlockLattice, closed: bool = False) -> tuple[Any, Any]:
+def active_cells(s: Any, lattice: Lattice | BlockLattice) -> tuple[Any, Any]:
     """Cells whose corners have different signs, by their lowest vertex, and few others.
 
     This is the one pass over the whole field, so the field is read once and packed into one bit per
     vertex; a neighbour is then a shift in the stream of bits. The vertices at the upper borders count
     as cells too, for the edges that they own; their corners outside the lattice are wrapped around.
 
-    Args:
-        closed: vertices on the border of the lattice count as outside.
-
     Returns:
         The cells and the words of signs, 32 vertices each: bit set for inside.
     """
     if isinstance(lattice, Lattice):
-        inside = pack_signs(s)
-        if closed:
-            border = border_vertices(lattice, type(inside))
-            others = ~(type(inside)(1) << (border & 31))
-            dr.scatter_reduce(dr.ReduceOp.And, inside, others, border >> 5, mode=dr.ReduceMode.Local)
-            dr.eval(inside)
+        inside = closed_signs(pack_signs(s), lattice)
         return sign_changes(inside, lattice), inside
     inside = lattice.signs(s)
-    if closed:
+    if lattice.lattice.closes_at_border:
         inside &= ~lattice.border()
     dr.eval(inside)
     return _sign_changes_in_blocks(inside, lattice), inside
@@ -70,6 +62,16 @@ def pack_signs(s: Any) -> Any:
         value = dr.gather(type(s), s, dr.minimum(word * 32 + bit, last))
         inside |= dr.select(value < NEGATIVE, uint_t(1 << bit), 0)
     dr.eval(inside)
+    return inside
+
+
+def closed_signs(inside: Any, lattice: Lattice) -> Any:
+    """The words of signs, where the lattice closes at its border without the bits there; changes them."""
+    if lattice.closes_at_border:
+        border = border_vertices(lattice, type(inside))
+        others = ~(type(inside)(1) << (border & 31))
+        dr.scatter_reduce(dr.ReduceOp.And, inside, others, border >> 5, mode=dr.ReduceMode.Local)
+        dr.eval(inside)
     return inside
 
 

@@ -147,6 +147,18 @@ def test_finds_the_same_blocks_of_a_function_and_of_values(lattice):
     assert extract(found, sdf(found.points(mi.Float))).to_trimesh().body_count == 2
 
 
+def test_same_mesh_of_a_body_that_the_border_cuts(lattice):
+    """FlexiCubes close it along the border, blocks away from any change of the sign."""
+    lattice = make_lattice(lattice.grid, 140)
+
+    def sdf(p):
+        return dr.norm(mi.Vector3f(p.x, p.y, p.z + 1)) - 0.9
+
+    whole = sdf(lattice.points(mi.Float))
+    for blocks in (BlockLattice.around(lattice, whole), BlockLattice.around(lattice, sdf, mi.Float)):
+        _assert_equal(extract(blocks, blocks.take(whole)), extract(lattice, whole))
+
+
 def test_stored_vertices_are_those_of_the_lattice(lattice):
     p = lattice.points(mi.Float)
     blocks = BlockLattice.around(lattice, _ball(p, 0.5, x=0.6))

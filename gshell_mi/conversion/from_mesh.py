@@ -225,8 +225,7 @@ def _fitted_msdf(
         jacobi = diags_array(1 / normal.diagonal())
         values, _ = cg(normal.tocsr(), right, x0=values, rtol=1e-4, maxiter=150, M=jacobi)
         found = interpolate @ values
-        patch = _patches(found > 0, edges)
-        speck = (np.bincount(patch) < _SPECK)[patch]
+        speck = _specks(found, wanted, edges)
         # Where caps and layers share lattice vertices, caps prevail at the rims, so that these do not run
         # into each other, and the mesh elsewhere. Nothing small is left over.
         missed = ((found > 0) != (wanted > 0)) & (beside_rim != (wanted > 0))
@@ -237,8 +236,7 @@ def _fitted_msdf(
         importance[speck] *= 8
     for _ in range(_SIGN_ROUNDS):  # what the fit could not remove goes by force
         found = interpolate @ values
-        patch = _patches(found > 0, edges)
-        speck = np.flatnonzero((np.bincount(patch) < _SPECK)[patch])
+        speck = np.flatnonzero(_specks(found, wanted, edges))
         if len(speck) == 0:
             break
         ends = interpolate[speck].tocoo()
@@ -286,6 +284,13 @@ def _rim_distance(
     nearer = np.take_along_axis(leaps, inner[leaps].argmin(axis=1)[:, None], axis=1)
     wanted[np.flatnonzero(known)[nearer]] = -h / 4
     return np.copysign(np.maximum(np.abs(wanted), 1e-3 * h), wanted), beside_rim
+
+
+def _specks(found: np.ndarray, wanted: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Which vertices lie in patches that are too small, or mostly of a sign that they should not have."""
+    patch = _patches(found > 0, edges)
+    size, wrong = np.bincount(patch), np.bincount(patch, (found > 0) != (wanted > 0))
+    return ((size < _SPECK) | (wrong > size / 2))[patch]
 
 
 def _patches(positive: np.ndarray, edges: np.ndarray) -> np.ndarray:

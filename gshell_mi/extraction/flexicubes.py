@@ -51,7 +51,6 @@ class FlexiCubesExtraction(GridExtraction):
     """FlexiCubes."""
 
     EDGE_DIFFERENCES = 0b00010110
-    CLOSED_AT_BORDER = True
 
     def __init__(self, lattice: FlexiCubesLattice | BlockLattice, float_t: type):
         super().__init__(lattice, float_t)

@@ -53,9 +53,6 @@ class GridExtraction(ABC):
     EDGE_DIFFERENCES: ClassVar[int]
     """Bit d: the lattice has edges from the lowest corner of a cell to corner d."""
 
-    CLOSED_AT_BORDER: ClassVar[bool] = False
-    """Vertices on the border of the lattice count as outside."""
-
     def __init__(self, lattice: Lattice | BlockLattice, float_t: type):
         self.lattice = lattice
         self.float_t = float_t
@@ -95,7 +92,7 @@ class GridExtraction(ABC):
 
     def active_cells(self, s: Any) -> ActiveCells:
         """The cells with crossed edges and few others."""
-        cell, inside = active_cells(s, self.lattice, self.CLOSED_AT_BORDER)
+        cell, inside = active_cells(s, self.lattice)
         # Operands of size 0 do not go together with others of size 1.
         return self.classify(inside, cell) if dr.width(cell) else ActiveCells(inside, cell, cell, cell, cell)
 
