@@ -11,6 +11,7 @@ import numpy as np
 from .compat import mesh_scene
 from .topology import topology, vertex_components
 from .views import PinholeViews
+from .visibility import seen
 
 #: A piece of less than this fraction of the surface's area is a floater.
 FLOATER = 0.02
@@ -20,9 +21,6 @@ CONTACT_LIMIT, UNOBSERVED_LIMIT = 0.05, 0.05
 
 #: Sheets touch if a ray along the normal meets the other one within a cell, and that faces this one.
 _FACING = -0.5
-
-#: A point is seen if nothing is nearer to the camera than this fraction of its distance.
-_UNTIL = 0.999
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ def diagnose(surface: tuple[np.ndarray, np.ndarray], template: tuple[np.ndarray,
     centers = corners.mean(axis=1)
     floaters = _floaters(len(vertices), faces, area)
     touching = _touching(centers, normals, template, cell)
-    unseen = area * ~_seen(centers, surface, views)
+    unseen = area * ~seen(centers, surface, views)
     total = max(area.sum(), 1e-30)
     center = tuple(float(x) for x in unseen @ centers / unseen.sum()) if unseen.any() else None
     return Diagnostics(counts.components - floaters, floaters, counts.boundary_loops, counts.pinholes,
@@ -125,20 +123,6 @@ def _touching(centers: np.ndarray, normals: np.ndarray, template: tuple[np.ndarr
         hit = scene.ray_intersect(mi.Ray3f(start, direction, cell, 0.0, mi.Color0f()))
         touching |= (hit.is_valid() & (dr.dot(hit.n, normal) < _FACING)).numpy()
     return touching
-
-
-def _seen(points: np.ndarray, surface: tuple[np.ndarray, np.ndarray], views: PinholeViews) -> np.ndarray:
-    """Which points of a surface some view frames with nothing before them."""
-    scene = mesh_scene(*surface)
-    target = _vectors(mi.Point3f, points)
-    seen = dr.full(mi.Bool, False, len(points))
-    for view in range(len(views)):
-        film, depth = views.project(view, target)
-        framed = (depth > 0) & (film.x >= 0) & (film.x <= 1) & (film.y >= 0) & (film.y <= 1)
-        origin = views.origins_of(dr.opaque(mi.UInt32, view))
-        seen |= framed & ~scene.ray_test(mi.Ray3f(origin, target - origin, _UNTIL, 0.0, mi.Color0f()), framed)
-        dr.eval(seen)
-    return seen.numpy()
 
 
 def _vectors(kind: type, rows: np.ndarray):

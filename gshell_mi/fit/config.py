@@ -15,7 +15,8 @@ _LEAST = {"resolution": 4, "start_resolution": 4, "band_resolution": 4, "triptyc
           "max_depth": 2, "reparam_depth": 1, "light_height": 3}
 
 #: Greatest sensible value, where there is one.
-_MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "warmup": 1, "reparam_depth": 3}
+_MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "unseen_area": 1, "warmup": 1,
+         "reparam_depth": 3}
 
 #: What ``--preview`` saves time with.
 _PREVIEW = {"resolution": 48, "ghost_batch": 16384, "carving_iterations": 0, "refinement_iterations": 0,
@@ -120,6 +121,9 @@ class FitConfig:
     sheet_thickness: float = 0.5
     """Closed parts that are at most so thick, in cells, come out as a single open sheet; 0 keeps both sides
     of every sheet, beside openings too."""
+    unseen_area: float = 0.02
+    """What no view sees, from neither side, is opened if it is connected and larger than this fraction of
+    the template's area; 1 keeps it."""
 
     # --- joint stage: geometry, material and light by path tracing
     field: Literal["explicit", "multiresolution", "hashgrid", "sinusoidal"] = "explicit"

@@ -118,10 +118,18 @@ def without_specks(msdf: mi.Float, template: SurfaceMesh, lattice: Lattice, min_
         cleaned = clean_opacity(values, vertices, faces, min_area)
         if (cleaned == values).all():
             break
-        # Only what flips is written anew: on its way over the mesh and back a field loses its details.
-        total, weight = _splat(mi.Float(cleaned), template, lattice, mi.Bool(cleaned != values))
-        msdf = dr.select(weight > 0, total / dr.maximum(weight, 1e-12), msdf)
+        msdf = rewritten(msdf, cleaned, cleaned != values, template, lattice)
     return msdf
+
+
+def rewritten(msdf: mi.Float, values: np.ndarray, changed: np.ndarray, template: SurfaceMesh,
+              lattice: Lattice) -> mi.Float:
+    """ν with new values at the template's vertices that have changed.
+
+    Only these are written: on its way over the mesh and back a field loses its details.
+    """
+    total, weight = _splat(mi.Float(values.astype(np.float32)), template, lattice, mi.Bool(changed))
+    return dr.select(weight > 0, total / dr.maximum(weight, 1e-12), msdf)
 
 
 def _splat(values: mi.Float, template: SurfaceMesh, lattice: Lattice,

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,17 +14,18 @@ import numpy as np
 from ..errors import UserError
 from ..export import check_output_folder, export_fit, make_output_folder, write_metrics
 from ..export.asset import write_asset
+from ..fields import LatticeFields
 from ..fields.interpolation import Interpolation
 from ..fields.lattice_fields import closed_at_border
 from ..fields.thin_parts import thickened, thin_part_refinement
 from ..fields.visual_hull import visual_hull
-from ..files import replacing
 from ..lattice import CubeLattice, make_lattice
 from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
 from ..scene import load_fit_scene
 from ..topology import topology
 from ..views import PinholeViews
+from .bookkeeping import Bookkeeping, checkpoint_path
 from .carving import carve
 from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
 from .config import FitConfig, default_output
@@ -49,17 +47,13 @@ from .recast import recast
 from .refinement import PhotometricRefinement
 from .spare_sides import Cut, without_spare_sides
 from .start import TYPICAL_REFLECTANCE, block_arrays, check_given, start_fields, start_light, start_material
+from .unseen import without_unseen
 
 #: What the joint stage starts from.
 _SURFACE = ("sdf", "msdf", "radiance", "known")
 
 #: Every eighth view is kept from the refinement and judges it.
 _HOLD_OUT = 8
-
-#: Between two checkpoints at least this many times what writing one takes.
-_CHECKPOINT_PAUSE = 10
-
-STAGES = ("hull", "ghost", "carving", "refinement", "field", "joint", "done")
 
 
 @dataclass(frozen=True)
@@ -108,13 +102,14 @@ class _Fit:
     def __init__(self, scene: Path, output: Path, targets: str | Path | None, config: FitConfig, resume: bool,
                  overwrite: bool, report: bool, progress: Progress, interrupt: Interrupt,
                  observer: Observer | None):
-        self.config, self.output, self.report, self.observer = config, output, report, observer
+        self.config, self.output, self.report = config, output, report
         self.progress, self.interrupt = progress, interrupt
-        self.path = output / "checkpoint.npz"
         self.checkpoint = Checkpoint("hull", 0, _plain(config))
         if resume:
-            self.checkpoint = Checkpoint.load(self.path)
+            self.checkpoint = Checkpoint.load(checkpoint_path(output))
             _same_config(self.checkpoint.config, _plain(config))
+        self.books = Bookkeeping(output, self.checkpoint, config.checkpoint_seconds, progress, interrupt,
+                                 observer)
         check_output_folder(output, keep=resume, overwrite=overwrite)
         with progress.stage("targets", None):
             self.scene = load_fit_scene(scene, Path(targets) if targets else None,
@@ -139,7 +134,7 @@ class _Fit:
         try:
             if self.checkpoint.stage == "hull":
                 self._hull()
-            self._rewind_log()
+            self.books.rewind_log()
             if self.checkpoint.stage == "ghost":
                 self._ghost()
             if self.checkpoint.stage == "carving":
@@ -148,7 +143,7 @@ class _Fit:
                 self._refine()
             joint = self._joint()
             self.interrupt.check()
-            with self.progress.stage("export", None), self._timed("export"):
+            with self.progress.stage("export", None), self.books.timed("export"):
                 metrics = export_fit(self.output, self.scene, joint, self.config)
                 metrics |= findings(self.scene, self.views, joint.scene, self.progress.warn)
             metrics = self._write_metrics(metrics)
@@ -178,7 +173,7 @@ class _Fit:
         if self.scene.subject.filename:
             self._start_from_file()
             return
-        with self.progress.stage("visual hull", len(self.views)) as advance, self._timed("hull"):
+        with self.progress.stage("visual hull", len(self.views)) as advance, self.books.timed("hull"):
             to_world = mi.Transform4f(self.scene.subject.to_world)
             finer = thin_part_refinement(self.lattice.resolution)
             samples = CubeLattice(finer * self.lattice.resolution)
@@ -196,19 +191,19 @@ class _Fit:
             raise UserError(
                 f"The masks of the targets have no common volume in the box of '{self.scene.path}'; check "
                 f"the cameras, the alpha of the targets and the gshell shape's to_world.")
-        self._enter("ghost", sdf=sdf, hull=hull)
+        self.books.enter("ghost", sdf=sdf, hull=hull)
 
     def _start_from_file(self) -> None:
         """Starts from the fields that the scene's gshell shape was given, openings included."""
         fields = self.scene.subject.fields().to_lattice(self.lattice.resolution, self.lattice.grid)
         if self.config.watertight or (fields.msdf > 0).all():
-            self._enter("ghost", sdf=fields.sdf, hull=fields.sdf)
+            self.books.enter("ghost", sdf=fields.sdf, hull=fields.sdf)
             return
         count = self.lattice.vertex_count
         brightness = self.pixels.mean_radiance()
-        self._enter("joint", sdf=fields.sdf, msdf=fields.msdf, deform=fields.deform,
-                    radiance=np.zeros((count, 3), np.float32), known=np.zeros(count, bool),
-                    light=np.float32(brightness / TYPICAL_REFLECTANCE))
+        self.books.enter("joint", sdf=fields.sdf, msdf=fields.msdf, deform=fields.deform,
+                         radiance=np.zeros((count, 3), np.float32), known=np.zeros(count, bool),
+                         light=np.float32(brightness / TYPICAL_REFLECTANCE))
 
     def _ghost(self) -> None:
         """Finds the openings of the template, and its radiance."""
@@ -218,8 +213,9 @@ class _Fit:
         vertices, faces = template.vertices, template.faces
         ghost = RadianceGhost(template.start, faces, self.views, self.pixels, self.config)
         if not self.config.watertight:
-            self._iterate("ghost", self.config.ghost_iterations, ghost, {"ghost": ghost.optimizer}, state)
-        with self.progress.stage("openings", None), self._timed("ghost"):
+            self.books.iterate("ghost", self.config.ghost_iterations, ghost, {"ghost": ghost.optimizer},
+                               state)
+        with self.progress.stage("openings", None), self.books.timed("ghost"):
             logits = np.ones(len(vertices))
             if not self.config.watertight:
                 logits = self._openings(ghost, vertices, faces)
@@ -233,8 +229,9 @@ class _Fit:
         radiance, known = splat_to_lattice(mi.Float(front.ravel()), template.mesh, self.lattice)
         light = float(np.median(front[~opened].mean(axis=1)))
         radiance = radiance.numpy().reshape(-1, 3)
-        self._enter("carving", sdf=state["sdf"], hull=state["hull"], msdf=msdf.numpy(), radiance=radiance,
-                    known=known.numpy(), light=np.float32(light / TYPICAL_REFLECTANCE))
+        self.books.enter("carving", sdf=state["sdf"], hull=state["hull"], msdf=msdf.numpy(),
+                         radiance=radiance, known=known.numpy(),
+                         light=np.float32(light / TYPICAL_REFLECTANCE))
 
     def _openings(self, ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """(V,) opacity logits of a fitted ghost, negative where the images justify an opening."""
@@ -253,12 +250,12 @@ class _Fit:
             volume = RadianceVolume(state["hull"].reshape((self.lattice.stride,) * 3), vertices, faces,
                                     self.scene.subject.to_world, self.views, known, self.config,
                                     self.checkpoint.iteration)
-            self._iterate("carving", count, volume, volume.optimizers, state)
-            with self.progress.stage("hollows", None), self._timed("carving"):
+            self.books.iterate("carving", count, volume, volume.optimizers, state)
+            with self.progress.stage("hollows", None), self.books.timed("carving"):
                 carved = carve(self.scene.subject, state, self.lattice, volume, known, unknown)
         self.checkpoint.facts["carved"] = carved is not None
         kept = {name: state[name] for name in ("hull", *_SURFACE)}
-        self._enter("refinement", **(kept | (carved or {})), light=state["light"])
+        self.books.enter("refinement", **(kept | (carved or {})), light=state["light"])
 
     def _refine(self) -> None:
         """Moves the template inside the hull, and the fields with it."""
@@ -271,14 +268,24 @@ class _Fit:
             moved, radiance, kept = self._refined(template, state)
         fields = None
         if (moved != template.vertices).any():
-            with self._timed("refinement"):
+            with self.books.timed("refinement"):
                 for cut in self._cuts(template, moved):
                     fields = recast(self.scene.subject, template.vertices, cut.positions, template.faces,
                                     cut.logits, radiance, self.config.ghost_min_area, cut.topology)
                     if fields:
                         break
         self.checkpoint.facts["refinement_kept"] = kept and fields is not None
-        self._enter("joint", **(fields or {name: state[name] for name in _SURFACE}), light=state["light"])
+        found = fields or {name: state[name] for name in _SURFACE}
+        self.books.enter("joint", **found | self._without_unseen(found), light=state["light"])
+
+    def _without_unseen(self, surface: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The mSDF that cuts away what no view sees, if there is such."""
+        if self.config.watertight or self.config.unseen_area >= 1:
+            return {}
+        closed = LatticeFields.closed(surface["sdf"], self.lattice.grid)
+        fields = dataclasses.replace(closed, msdf=surface["msdf"])
+        msdf = without_unseen(self.scene.subject, fields, self.views, self.config.unseen_area)
+        return {} if msdf is None else {"msdf": msdf.numpy()}
 
     def _cuts(self, template: GhostTemplate, moved: np.ndarray) -> list[Cut]:
         """How to cut a moved template, the best first."""
@@ -304,9 +311,9 @@ class _Fit:
             outlines = Outlines(self.views, alphas, faces, solid)
         cell = self.scene.subject.cell_size
         refinement = PhotometricRefinement(ghost, start, faces, outlines, cell, self.config)
-        self._iterate("refinement", self.config.refinement_iterations, refinement,
-                      {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
-        with self._timed("refinement"):
+        self.books.iterate("refinement", self.config.refinement_iterations, refinement,
+                           {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
+        with self.books.timed("refinement"):
             ghost.move(mi.Float(refinement.positions().ravel()))
             ghost.refit(solid)
             kept = ghost.unexplained(unknown) < self.config.refinement_gain * unexplained
@@ -328,15 +335,14 @@ class _Fit:
                            start_light(self.scene, start, self.config), self.config)
         self._fit_field(joint)
         if self.checkpoint.stage == "joint":
-            self._iterate("joint", self.config.iterations, joint, joint.optimizers, start,
-                          lambda: block_arrays(self.scene.subject.fields()))
+            self.books.iterate("joint", self.config.iterations, joint, joint.optimizers, start,
+                               lambda: block_arrays(self.scene.subject.fields()))
         else:
             for name, optimizer in joint.optimizers.items():
                 restore_optimizer(name, optimizer, self.checkpoint.arrays)
         joint.finish()
         if self.checkpoint.stage == "joint":
-            self.checkpoint.stage = "done"
-            self.checkpoint.save(self.path)
+            self.books.leave()
         return joint
 
     def _write_metrics(self, metrics: dict) -> dict:
@@ -349,14 +355,15 @@ class _Fit:
         state, geometry = self.checkpoint, joint.geometry
         fitted = geometry.fitting_steps == 0 or any(name.startswith("geometry/") for name in state.arrays)
         if state.stage == "joint" and not fitted:
-            self._enter("field", **state.arrays)
+            self.books.enter("field", **state.arrays)
         if state.stage == "field":
             start = {name: array for name, array in state.arrays.items() if "/" not in name}
-            self._iterate("field", geometry.fitting_steps, FieldFitting(joint), geometry.optimizers, start)
+            self.books.iterate("field", geometry.fitting_steps, FieldFitting(joint), geometry.optimizers,
+                               start)
             geometry.begin()
             for name, optimizer in geometry.optimizers.items():
                 start |= optimizer_arrays(name, optimizer)
-            self._enter("joint", **start)
+            self.books.enter("joint", **start)
         elif state.stage == "joint" and state.iteration == 0 and geometry.fitting_steps:
             for name, optimizer in geometry.optimizers.items():
                 restore_optimizer(name, optimizer, state.arrays)
@@ -364,83 +371,12 @@ class _Fit:
     def _write_documents(self) -> None:
         """The asset and the report; for want of them a fit is not lost."""
         try:
-            with self.progress.stage("mesh.glb", None), self._timed("asset"):
+            with self.progress.stage("mesh.glb", None), self.books.timed("asset"):
                 write_asset(self.output)
-            with self.progress.stage("report", None), self._timed("report"):
+            with self.progress.stage("report", None), self.books.timed("report"):
                 write_report(self.output)
         except UserError as error:
             self.progress.warn(str(error))
-
-    # --- bookkeeping
-
-    def _iterate(self, stage: str, count: int,
-                 worker: RadianceGhost | RadianceVolume | PhotometricRefinement | FieldFitting | JointStage,
-                 optimizers: Mapping[str, mi.ad.Adam], constants: dict[str, np.ndarray],
-                 variables: Callable[[], dict[str, np.ndarray]] = dict) -> None:
-        """Runs the steps of a stage that are left, logging each and saving a checkpoint now and then."""
-        first = self.checkpoint.iteration
-        if first > 0:
-            for name, optimizer in optimizers.items():
-                restore_optimizer(name, optimizer, self.checkpoint.arrays)
-        constants = {name: constants[name] for name in constants if "/" not in name}
-
-        def save(done: int) -> None:
-            arrays = constants | variables()
-            for name, optimizer in optimizers.items():
-                arrays |= optimizer_arrays(name, optimizer)
-            self.checkpoint.iteration, self.checkpoint.arrays = done, arrays
-            self.checkpoint.save(self.path)
-
-        with self.progress.stage(stage, count, first) as advance:
-            saved, pause = time.monotonic(), self.config.checkpoint_seconds
-            for iteration in range(first, count):
-                begin = time.monotonic()
-                self.interrupt.check()
-                values = worker.step(iteration)
-                values = {name: float(value) for name, value in values.items()}
-                self._write_log(stage, iteration, values, time.monotonic() - begin)
-                advance(values)
-                if self.observer:
-                    self.observer.step(stage, iteration, count, values, worker.preview)
-                self._spent(stage, time.monotonic() - begin)
-                if time.monotonic() - saved > pause:
-                    begin = time.monotonic()
-                    save(iteration + 1)
-                    saved = time.monotonic()
-                    pause = max(self.config.checkpoint_seconds, _CHECKPOINT_PAUSE * (saved - begin))
-        save(count)
-
-    def _enter(self, stage: str, **arrays: np.ndarray) -> None:
-        """Starts a stage from ``arrays``."""
-        self.checkpoint.stage, self.checkpoint.iteration, self.checkpoint.arrays = stage, 0, arrays
-        self.checkpoint.save(self.path)
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        begin = time.monotonic()
-        yield
-        self._spent(stage, time.monotonic() - begin)
-
-    def _spent(self, stage: str, seconds: float) -> None:
-        self.checkpoint.seconds[stage] = round(self.checkpoint.seconds.get(stage, 0.0) + seconds, 3)
-
-    def _rewind_log(self) -> None:
-        """Drops the lines of steps that a killed run did after its last checkpoint: they are done again."""
-        path, kept = self.output / "log.jsonl", []
-        if path.exists():
-            reached = (STAGES.index(self.checkpoint.stage), self.checkpoint.iteration)
-            for line in path.read_text().splitlines(keepends=True):
-                step = json.loads(line) if line.endswith("\n") else None
-                if step and (STAGES.index(step["stage"]), step["iteration"]) < reached:
-                    kept.append(line)
-        with replacing(path) as partial:
-            partial.write_text("".join(kept))
-
-    def _write_log(self, stage: str, iteration: int, values: dict[str, float], seconds: float) -> None:
-        rounded = {name: float(f"{value:.6g}") for name, value in values.items()}
-        with open(self.output / "log.jsonl", "a") as log:
-            log.write(json.dumps({"stage": stage, "iteration": iteration, **rounded,
-                                  "seconds": round(seconds, 4)}) + "\n")
 
 
 def _plain(config: FitConfig) -> dict:

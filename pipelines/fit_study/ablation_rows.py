@@ -52,6 +52,7 @@ ROWS = [
     *_group("Photometric refinement",
             ("no-refinement", "off", {"refinement_iterations": 0}),
             ("no-sheets", "both sides of every sheet stay", {"sheet_thickness": 0.0}),
+            ("unseen-stays", "what no view sees stays", {"unseen_area": 1.0}),
             ("refinement-always", "kept unseen", {"refinement_gain": _ALWAYS}),
             ("no-refinement-outline", "silhouettes not held", {"refinement_outline": 0.0})),
     *_group("Geometry in the joint stage",

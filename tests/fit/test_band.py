@@ -117,7 +117,7 @@ def test_a_fit_in_blocks_is_resumed(bowl_scene, tmp_path, monkeypatch):
         return step(self, iteration)
 
     # However long it takes to save one.
-    monkeypatch.setattr("gshell_mi.fit.run._CHECKPOINT_PAUSE", 0)
+    monkeypatch.setattr("gshell_mi.fit.bookkeeping._CHECKPOINT_PAUSE", 0)
     monkeypatch.setattr(JointStage, "step", stopped)
     assert main(command) == 130
     monkeypatch.setattr(JointStage, "step", step)
