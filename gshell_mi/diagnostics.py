@@ -11,7 +11,7 @@ import numpy as np
 from .compat import mesh_scene
 from .topology import topology, vertex_components
 from .views import PinholeViews
-from .visibility import seen
+from .visibility import best_view
 
 #: A piece of less than this fraction of the surface's area is a floater.
 FLOATER = 0.02
@@ -98,7 +98,7 @@ def diagnose(surface: tuple[np.ndarray, np.ndarray], template: tuple[np.ndarray,
     centers = corners.mean(axis=1)
     floaters = _floaters(len(vertices), faces, area)
     touching = _touching(centers, normals, template, cell)
-    unseen = area * ~seen(centers, surface, views)
+    unseen = area * (best_view(centers, normals, surface, views) == 0)
     total = max(area.sum(), 1e-30)
     center = tuple(float(x) for x in unseen @ centers / unseen.sum()) if unseen.any() else None
     return Diagnostics(counts.components - floaters, floaters, counts.boundary_loops, counts.pinholes,

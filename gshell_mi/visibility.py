@@ -1,4 +1,4 @@
-"""Which points of a surface the cameras see."""
+"""How well the cameras see the points of a surface."""
 
 from __future__ import annotations
 
@@ -13,22 +13,30 @@ from .views import PinholeViews
 _UNTIL = 0.999
 
 
-def seen(points: np.ndarray, surface: tuple[np.ndarray, np.ndarray], views: PinholeViews) -> np.ndarray:
-    """(n,) whether some view frames a point with nothing before it, from whichever side of the surface.
+def best_view(points: np.ndarray, normals: np.ndarray, surface: tuple[np.ndarray, np.ndarray],
+              views: PinholeViews) -> np.ndarray:
+    """(n,) how squarely points of a surface are seen, from whichever side: 1 along the normal, 0 not at all.
+
+    That is the greatest cosine between the normal and the direction to a camera which frames the point and
+    has nothing before it.
 
     Args:
         points: (n, 3) on the surface, world units.
+        normals: (n, 3) unit vectors.
         surface: (V, 3) vertices and (F, 3) faces.
         views: the cameras.
     """
     scene = mesh_scene(*surface)
     target = mi.Point3f(np.ascontiguousarray(points.T, np.float32))
-    result = dr.full(mi.Bool, False, len(points))
+    normal = mi.Vector3f(np.ascontiguousarray(normals.T, np.float32))
+    result = dr.zeros(mi.Float, len(points))
     for view in range(len(views)):
         film, depth = views.project(view, target)
         framed = (depth > 0) & (film.x >= 0) & (film.x <= 1) & (film.y >= 0) & (film.y <= 1)
         origin = views.origins_of(dr.opaque(mi.UInt32, view))
         ray = mi.Ray3f(origin, target - origin, _UNTIL, 0.0, mi.Color0f())
-        result |= framed & ~scene.ray_test(ray, framed)
+        seen = framed & ~scene.ray_test(ray, framed)
+        cosine = dr.abs(dr.dot(normal, dr.normalize(ray.d)))
+        result = dr.select(seen, dr.maximum(result, cosine), result)
         dr.eval(result)
     return result.numpy()

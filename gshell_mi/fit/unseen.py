@@ -9,8 +9,11 @@ import numpy as np
 from ..fields import LatticeFields
 from ..fields.smoothing import MeshDiffusion
 from ..views import PinholeViews
-from ..visibility import seen
+from ..visibility import best_view
 from .opening import clean_opacity, rewritten
+
+#: What is seen at this cosine or less is as good as unseen: a hull ends in surfaces that views only graze.
+_GRAZING = 0.2
 
 #: Lambda that smooths the new rims along the template.
 _SMOOTHING = 3.0
@@ -34,8 +37,11 @@ def without_unseen(subject: mi.Shape, fields: LatticeFields, views: PinholeViews
     template, (vertices, faces, _) = subject.template(), subject.surface.to_numpy()
     places, cells, _ = template.to_numpy()
     values = template.interpolate(subject.msdf).numpy()
+    a, b, c = (places[cells[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     known = np.zeros(len(places), bool)
-    known[cells[seen(places[cells].mean(axis=1), (vertices, faces), views)]] = True
+    known[cells[best_view((a + b + c) / 3, normals, (vertices, faces), views) > _GRAZING]] = True
     # Patches of less than the area flip back.
     unseen = clean_opacity(np.where((values > 0) & ~known, -1.0, 1.0), places, cells, min_area) < 0
     if not unseen.any():
