@@ -124,6 +124,9 @@ def ensure_variant(name: str = "llvm_ad_rgb") -> None:
     if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise UserError(f"variant {name!r} needs an NVIDIA GPU and its driver, found none: use llvm_ad_rgb")
     mi.set_variant(name)
+    # With a single thread, as on a single core, Mitsuba (3.9.1) waits forever for itself to read an EXR file.
+    if dr.thread_count() < 2:
+        dr.set_thread_count(2)
 
 
 def _llvm_version() -> tuple[int, int, int] | None:

@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from gshell_mi import UserError, doctor
@@ -90,6 +91,23 @@ def test_ensure_variant(variant):
         with pytest.raises(UserError, match="needs an NVIDIA GPU"):
             ensure_variant("cuda_ad_rgb")
     assert mi.variant() == variant
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no way to hold a process to one core")
+def test_one_core_is_enough_to_read_an_image(tmp_path):
+    """Mitsuba reads EXR files in tasks of their own, and waits for them."""
+    image = tmp_path / "light.exr"
+    mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(image))
+    code = f"""
+import os
+os.sched_setaffinity(0, {{min(os.sched_getaffinity(0))}})
+import mitsuba as mi
+from gshell_mi.doctor import ensure_variant
+ensure_variant("llvm_ad_rgb")
+print(mi.load_dict({{"type": "envmap", "filename": {str(image)!r}}}))
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert "EnvironmentMapEmitter" in result.stdout
 
 
 def test_report(capsys):
