@@ -80,10 +80,14 @@ class GShell(mi.Mesh):
     filename: str
     """The file of the initial fields, or an empty string."""
 
+    grid_is_given: bool
+    """Whether the parameters name the kind of lattice, or a file that has one."""
+
     def __init__(self, props: mi.Properties):
         grid = props.get("grid", "tet")
         resolution = int(props["resolution"]) if "resolution" in props else None
         self.filename = props.get("filename", "")
+        self.grid_is_given = bool(self.filename) or "grid" in props
         smooth = not props.get("face_normals", False)
         band = props.get("band", False)
         self.to_world = compat.to_world(props)

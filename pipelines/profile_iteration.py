@@ -30,8 +30,7 @@ def joint_stage(scene: Path, output: Path):
     from gshell_mi.fit import FitConfig
     from gshell_mi.fit.checkpoint import Checkpoint, restore_optimizer
     from gshell_mi.fit.joint import JointStage
-    from gshell_mi.fit.start import start_fields, start_light, start_material
-    from gshell_mi.lattice import make_lattice
+    from gshell_mi.fit.start import fit_lattice, start_fields, start_light, start_material
     from gshell_mi.scene import load_fit_scene
 
     fit = load_fit_scene(scene)
@@ -39,9 +38,7 @@ def joint_stage(scene: Path, output: Path):
     known = FitConfig.__dataclass_fields__
     config = FitConfig(**{name: value for name, value in checkpoint.config.items() if name in known})
     arrays = checkpoint.arrays
-    given = fit.subject.lattice
-    lattice = make_lattice(given.grid, config.resolution or given.resolution)
-    fields = start_fields(arrays, lattice, config)
+    fields = start_fields(arrays, fit_lattice(fit.subject, config), config)
     fit.subject.set_fields(fields)
     material = start_material(fit, arrays, fields.lattice, config)
     joint = JointStage(fit, material, start_light(fit, arrays, config), config)

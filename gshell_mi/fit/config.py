@@ -35,7 +35,7 @@ class FitConfig:
     resolution: int | None = None
     """Cells per side of the lattice; default: that of the scene's gshell shape (64)."""
     grid: Literal["tet", "cube", "flexicubes", "bcc"] | None = None
-    """The kind of lattice; default: that of the scene's gshell shape (tet)."""
+    """The kind of lattice; default: that which the scene's gshell shape names, or flexicubes."""
     start_resolution: int = 64
     """Cells per side, at most, up to the joint stage, which interpolates what it starts from. Unused if the
     scene gives the fields."""

@@ -46,7 +46,16 @@ from .radiance_volume import RadianceVolume
 from .recast import recast
 from .refinement import PhotometricRefinement
 from .spare_sides import Cut, without_spare_sides
-from .start import TYPICAL_REFLECTANCE, block_arrays, check_given, start_fields, start_light, start_material
+from .start import (
+    EARLY_GRIDS,
+    TYPICAL_REFLECTANCE,
+    block_arrays,
+    check_given,
+    fit_lattice,
+    start_fields,
+    start_light,
+    start_material,
+)
 from .unseen import without_unseen
 
 #: What the joint stage starts from.
@@ -119,11 +128,10 @@ class _Fit:
             check_depth(self.scene, self.views)
         if not all(target.has_alpha for target in self.scene.targets):
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
-        given = self.scene.subject.lattice
-        self.resolution = config.resolution or given.resolution
+        self.last_lattice = last = fit_lattice(self.scene.subject, config)
         # Given fields may have detail that no coarser lattice holds.
-        coarse = self.resolution if self.scene.subject.filename else config.start_resolution
-        self.lattice = make_lattice(config.grid or given.grid, min(self.resolution, coarse))
+        coarse = last.resolution if self.scene.subject.filename else config.start_resolution
+        self.lattice = make_lattice(EARLY_GRIDS[last.grid], min(last.resolution, coarse))
         self.pixels = PixelPool(self.views, self.scene.targets)
         # Nothing of an earlier fit goes before all is known to be in order.
         make_output_folder(output, keep=resume)
@@ -159,9 +167,9 @@ class _Fit:
     def _check_memory(self, subject: mi.Shape, sensors: list[mi.Sensor]) -> None:
         """Says how much memory the fit needs, and refuses it if that much is not free."""
         sizes = np.array([sensor.film().crop_size() for sensor in sensors])
-        resolution = self.config.resolution or subject.lattice.resolution
-        grid = self.config.grid or subject.lattice.grid
-        self.memory = MemoryEstimate.of(self.config, resolution, sizes, grid=grid, report=self.report)
+        lattice = fit_lattice(subject, self.config)
+        self.memory = MemoryEstimate.of(self.config, lattice.resolution, sizes, grid=lattice.grid,
+                                        report=self.report)
         free = free_memory_of_variant()
         told = "" if free is None else f"; {free / GIB:.1f} GiB are free"
         self.progress.tell(f"memory: about {self.memory.total / GIB:.1f} GiB{told}")
@@ -269,6 +277,8 @@ class _Fit:
         fields = None
         if (moved != template.vertices).any():
             with self.books.timed("refinement"):
+                last = make_lattice(self.last_lattice.grid, self.lattice.resolution)
+                self.scene.subject.set_fields(LatticeFields.closed(state["sdf"], last.grid))
                 for cut in self._cuts(template, moved):
                     fields = recast(self.scene.subject, template.vertices, cut.positions, template.faces,
                                     cut.logits, radiance, self.config.ghost_min_area, cut.topology)
@@ -282,7 +292,7 @@ class _Fit:
         """The mSDF that cuts away what no view sees, if there is such."""
         if self.config.watertight or self.config.unseen_area >= 1:
             return {}
-        closed = LatticeFields.closed(surface["sdf"], self.lattice.grid)
+        closed = LatticeFields.closed(surface["sdf"], self.last_lattice.grid)
         fields = dataclasses.replace(closed, msdf=surface["msdf"])
         msdf = without_unseen(self.scene.subject, fields, self.views, self.config.unseen_area)
         return {} if msdf is None else {"msdf": msdf.numpy()}
@@ -329,7 +339,7 @@ class _Fit:
 
     def _joint(self) -> JointStage:
         start = dict(self.checkpoint.arrays)
-        fields = start_fields(start, make_lattice(self.lattice.grid, self.resolution), self.config)
+        fields = start_fields(start, self.last_lattice, self.config)
         self.scene.subject.set_fields(fields)
         joint = JointStage(self.scene, start_material(self.scene, start, fields.lattice, self.config),
                            start_light(self.scene, start, self.config), self.config)

@@ -11,7 +11,7 @@ from ..block_lattice import BlockLattice
 from ..errors import UserError
 from ..fields import LatticeFields
 from ..fields.interpolation import Interpolation
-from ..lattice import Lattice, lattice_of
+from ..lattice import Lattice, lattice_of, make_lattice
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, given_material
 from ..scene import FitScene
@@ -24,6 +24,20 @@ TYPICAL_REFLECTANCE = 0.5
 _KNOWN = 0.1
 
 _BAND = "band/"
+
+#: The kind of lattice where neither scene nor settings name one. Of equally many cells FlexiCubes come out
+#: nearest to the truth, with the smoothest rims and a third of the vertices of tetrahedra (docs/grids.md).
+_GRID = "flexicubes"
+
+#: Openings and hollows are found on tetrahedra, whose templates have vertices enough for that.
+EARLY_GRIDS = {"tet": "tet", "cube": "tet", "flexicubes": "tet", "bcc": "bcc"}
+
+
+def fit_lattice(subject: mi.Shape, config: FitConfig) -> Lattice:
+    """The lattice that a fit ends on; the stages before the joint one may have fewer cells."""
+    given = subject.lattice
+    grid = config.grid or (given.grid if subject.grid_is_given else _GRID)
+    return make_lattice(grid, config.resolution or given.resolution)
 
 
 def check_given(scene: FitScene, config: FitConfig) -> None:
