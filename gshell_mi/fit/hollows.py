@@ -32,10 +32,7 @@ _LID, _LID_COST = 1.6, 20.0
 _SHALLOW = 1.5
 
 #: Standard deviations, in cells, that smooth the opacity before the cut and the hollows' distance after it.
-_OPACITY_BLUR, _DISTANCE_BLUR = 0.5, 1.5
-
-#: Smoothing leaves the vertices of the lattice on their side, at least so far from the surface, in cells.
-_CLEARANCE = 0.1
+_OPACITY_BLUR, _DISTANCE_BLUR = 0.5, 0.5
 
 #: Flows are integers.
 _UNIT = 1000
@@ -64,11 +61,8 @@ def hollows(hull: np.ndarray, msdf: np.ndarray, opacity: np.ndarray, seen: np.nd
     if not hollow.any() or air.all():
         return None
     distance = ndimage.distance_transform_edt(air) - ndimage.distance_transform_edt(~air)
-    # Slopes come as steps of whole cells. Between them the surface may be anywhere (Whitaker 2000).
-    smooth = ndimage.gaussian_filter(distance, _DISTANCE_BLUR)
-    distance = np.where(air, np.maximum(smooth, _CLEARANCE), np.minimum(smooth, -_CLEARANCE))
     near = ndimage.binary_dilation(hollow, iterations=3)
-    return np.where(near, distance, -np.inf)
+    return np.where(near, ndimage.gaussian_filter(distance, _DISTANCE_BLUR), -np.inf)
 
 
 def _minimum_cut(inside: np.ndarray, lid: np.ndarray, opacity: np.ndarray, hidden: np.ndarray) -> np.ndarray:
