@@ -135,5 +135,5 @@ def test_all_modes_at_once_resume(scene, tmp_path):
     modes = ("--watertight", "--known-light", "--fixed-material", "--refinement-iterations", "0")
     fit(scene, output, *modes, "--iterations", "2")
     stored = np.load(output / "checkpoint.npz")
-    assert {name.split("/")[1] for name in stored.files if "/" in name} == {"sdf", "deform"}
+    assert {name.split("/")[1] for name in stored.files if "/" in name} == {"sdf", "deform", "weights"}
     fit(scene, output, *modes, "--iterations", "2", "--resume")
