@@ -7,8 +7,8 @@ killed at ``--kills`` moments drawn uniformly from that time, from the start of 
 after each kill every file in the folder is read, and the fit goes on with ``--resume`` (or from the start, if
 it was killed before its first checkpoint). At the end the differences of the killed fit to the whole ones are
 printed beside those of the whole ones to each other: threads add up in an order that changes, so no two fits
-are the same. ``--one-core`` leaves one thread, and so one order; if whole fits are equal then, the killed one
-has to be. Exit code 1 if on average the killed fit is farther from the whole ones than any two of these.
+are the same. ``--one-core`` keeps all threads on one core, where orders change less; if whole fits are equal,
+the killed one has to be. Exit code 1 if on average the killed fit is farther from the whole ones than any two of these.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=10, help="kills of the one fit (default 10)")
     parser.add_argument("--whole", type=int, default=3, help="fits that nothing kills (default 3)")
     parser.add_argument("--seed", type=int, default=0, help="of the moments (default 0)")
-    parser.add_argument("--one-core", action="store_true", help="one thread, which adds in one order (Linux)")
+    parser.add_argument("--one-core", action="store_true", help="keep all threads on one core (Linux)")
     own, options = sys.argv[1:], []
     if "--" in own:
         own, options = own[:own.index("--")], own[own.index("--") + 1:]

@@ -20,6 +20,8 @@ _PER_VERTEX = 490  # of the lattice: fields and material, their Adam moments and
 _PER_HULL_SAMPLE = 75  # of the visual hull, which is finer than the lattice, and ...
 _PER_VOTE = 4  # ... what it keeps there per view that has to see daylight
 _PER_SQUARE_CELL = 37_000  # resolution squared, as the surface grows: meshes, edge lists, derivatives
+_PER_WEIGHT = 20  # of FlexiCubes: its gradient and Adam's moments, too ...
+_WEIGHTS_PER_SQUARE_CELL = 900  # ... where only blocks around the surface have some
 _PER_SAMPLE = 50  # of a rendered image
 
 
@@ -58,9 +60,10 @@ class MemoryEstimate:
         True
         """
         # Fields in blocks follow the surface.
-        whole = resolution
+        whole, weights = resolution, make_lattice(grid, resolution).weight_count
         if resolution >= config.band_resolution and make_lattice(grid, 1).fits_in_blocks:
             whole = min(resolution, config.start_resolution)
+            weights = min(weights, _WEIGHTS_PER_SQUARE_CELL * resolution**2)
         vertices = make_lattice(grid, whole).vertex_count
         pixels = np.asarray(sizes, np.int64).prod(axis=1)
         votes = config.hull_daylight_votes * len(pixels)
@@ -68,7 +71,7 @@ class MemoryEstimate:
         return cls(
             program=_PROGRAM + (_ASSET if report else 0),
             hull=int((_PER_HULL_SAMPLE + _PER_VOTE * votes) * hull_samples),
-            lattice=_PER_VERTEX * vertices + _PER_SQUARE_CELL * resolution**2,
+            lattice=_PER_VERTEX * vertices + _PER_SQUARE_CELL * resolution**2 + _PER_WEIGHT * weights,
             targets=_PER_PIXEL * int(pixels.sum()),
             samples=_PER_SAMPLE * int(pixels.max()) * max(config.primal_spp, config.spp))
 

@@ -277,8 +277,8 @@ class _Fit:
         fields = None
         if (moved != template.vertices).any():
             with self.books.timed("refinement"):
-                last = make_lattice(self.last_lattice.grid, self.lattice.resolution)
-                self.scene.subject.set_fields(LatticeFields.closed(state["sdf"], last.grid))
+                # From here on the surface is drawn as in the joint stage, from values at the same vertices.
+                self.scene.subject.set_fields(LatticeFields.closed(state["sdf"], self.last_lattice.grid))
                 for cut in self._cuts(template, moved):
                     fields = recast(self.scene.subject, template.vertices, cut.positions, template.faces,
                                     cut.logits, radiance, self.config.ghost_min_area, cut.topology)
