@@ -7,8 +7,9 @@ killed at ``--kills`` moments drawn uniformly from that time, from the start of 
 after each kill every file in the folder is read, and the fit goes on with ``--resume`` (or from the start, if
 it was killed before its first checkpoint). At the end the differences of the killed fit to the whole ones are
 printed beside those of the whole ones to each other: threads add up in an order that changes, so no two fits
-are the same. ``--one-core`` keeps all threads on one core, where orders change less; if whole fits are equal,
-the killed one has to be. Exit code 1 if on average the killed fit is farther from the whole ones than any two of these.
+are the same. ``--one-core`` keeps all threads on one core, where orders change less; if whole fits are
+equal, the killed one has to be. Exit code 1 if on average the killed fit is farther from the whole ones than
+any two of these.
 """
 
 from __future__ import annotations
