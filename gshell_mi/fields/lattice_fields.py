@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..block_lattice import BlockLattice
 from ..errors import UserError
 from ..lattice import Lattice, lattice_of, make_lattice
+
+#: Steps that find the point an offset has brought somewhere; the error halves with each, or better.
+_FIXED_POINT_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -62,8 +66,8 @@ class LatticeFields:
     def to_lattice(self, resolution: int, grid: str | None = None) -> LatticeFields:
         """The fields interpolated on another lattice; neutral weights. Needs a variant.
 
-        Offsets are kept as lengths: they double in units of ``deform`` when the cells halve, and are
-        clipped to what the new lattice allows.
+        Offsets are kept as lengths: they double in units of ``deform`` when the cells halve. What of them
+        the new lattice does not allow goes into the other fields, so that the surface stays in place.
 
         Args:
             resolution: cells per side.
@@ -80,22 +84,15 @@ class LatticeFields:
             return LatticeFields(self.sdf, self.msdf, self.deform, self.grid)
         import mitsuba as mi
 
-        from .interpolation import Interpolation
-
-        points = new.points(mi.Float)
-        sdf, msdf, deform = (Interpolation(mi.Float(field), old)(points).numpy()
-                             for field in (self.sdf, self.msdf, self.deform))
-        return LatticeFields(sdf, msdf, np.clip(deform * (old.max_offset / new.max_offset), -1, 1), new.grid)
+        fields = self._at(new.points(mi.Float), new.max_offset)
+        return LatticeFields(**{name: field.numpy() for name, field in fields.items()}, grid=new.grid)
 
     def in_blocks(self, resolution: int | None = None) -> LatticeFields:
         """The fields in blocks around their surface, of this lattice or, interpolated, of a finer one.
 
         As ``to_lattice``, but only the blocks are ever in memory. Needs a Mitsuba variant.
         """
-        import drjit as dr
         import mitsuba as mi
-
-        from .interpolation import Interpolation
 
         old, new = self.lattice, make_lattice(self.grid, resolution or self.lattice.resolution)
         given = {name: mi.Float(getattr(self, name)) for name in ("sdf", "msdf", "deform")}
@@ -103,13 +100,32 @@ class LatticeFields:
             blocks = BlockLattice.around(old, given["sdf"])
             fields = {name: blocks.take(field) for name, field in given.items()}
         else:
-            at = {name: Interpolation(field, old) for name, field in given.items()}
-            blocks = BlockLattice.around(new, at["sdf"], mi.Float)
-            points = blocks.points(mi.Float)
-            fields = {name: field(points) for name, field in at.items()}
-            fields["deform"] = dr.clip(fields["deform"] * (old.max_offset / new.max_offset), -1, 1)
+            blocks = BlockLattice.around(new, lambda points: self._at(points, new.max_offset)["sdf"],
+                                         mi.Float)
+            fields = self._at(blocks.points(mi.Float), new.max_offset)
         return LatticeFields(**{name: field.numpy() for name, field in fields.items()}, grid=self.grid,
                              blocks=blocks.blocks.numpy(), block_resolution=new.resolution)
+
+    def _at(self, points: Any, max_offset: float) -> dict[str, Any]:
+        """The fields that another lattice has at its vertices ``points`` for the surface to stay in place."""
+        import drjit as dr
+        import mitsuba as mi
+
+        from .interpolation import Interpolation
+
+        at = {name: Interpolation(mi.Float(getattr(self, name)), self.lattice)
+              for name in ("sdf", "msdf", "deform")}
+
+        def offset(vertices: mi.Point3f) -> mi.Vector3f:
+            return self.lattice.max_offset * mi.Vector3f(at["deform"].channels(vertices))
+
+        limited = dr.clip(offset(points) / max_offset, -1, 1)
+        # Where the offset is cut short, the values are those of another point, which is found step by step.
+        source, goal = mi.Point3f(points), points + max_offset * limited
+        for _ in range(_FIXED_POINT_STEPS):
+            source = goal - offset(source)
+            dr.eval(source)
+        return {"sdf": at["sdf"](source), "msdf": at["msdf"](source), "deform": dr.ravel(limited)}
 
     def save(self, path: str | Path) -> None:
         """Writes a compressed .npz with the arrays ``sdf``, ``msdf``, ``deform`` and, if any, the others."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +17,9 @@ _LEAST = {"resolution": 4, "start_resolution": 4, "band_resolution": 4, "triptyc
 #: Greatest sensible value, where there is one.
 _MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "unseen_area": 1, "warmup": 1,
          "reparam_depth": 3}
+
+#: What the detail stage takes of the first steps of the joint stage for material and light.
+_CALMER = 0.3
 
 #: What ``--preview`` saves time with.
 _PREVIEW = {"resolution": 48, "ghost_batch": 16384, "carving_iterations": 0, "refinement_iterations": 0,
@@ -37,8 +40,7 @@ class FitConfig:
     grid: Literal["tet", "cube", "flexicubes", "bcc"] | None = None
     """The kind of lattice; default: that which the scene's gshell shape names, or flexicubes."""
     start_resolution: int = 64
-    """Cells per side, at most, up to the joint stage, which interpolates what it starts from. Unused if the
-    scene gives the fields."""
+    """Cells per side, at most, up to the detail stage. Unused if the scene gives the fields."""
     band_resolution: int = 128
     """From this resolution on the joint stage stores its fields in blocks around the surface."""
     checkpoint_seconds: float = 10.0
@@ -133,6 +135,9 @@ class FitConfig:
     """Steps of the joint stage."""
     warmup: float = 0.15
     """Fraction of these steps in which only material and light move."""
+    detail_iterations: int = 120
+    """Steps of the detail stage, which continues the joint stage on a lattice finer than --start-resolution;
+    0 runs the joint stage itself on that lattice."""
     spp: int = 8
     """Samples per pixel of the gradient render."""
     primal_spp: int = 16
@@ -199,6 +204,11 @@ class FitConfig:
         (3, 0)
         """
         return cls(**_PREVIEW | others)
+
+    def for_detail(self) -> FitConfig:
+        """The settings of the joint stage as those of the detail stage, which begins where that has ended."""
+        return replace(self, iterations=self.detail_iterations, warmup=0,
+                       material_lr=_CALMER * self.material_lr, light_lr=_CALMER * self.light_lr)
 
     @property
     def light_is_given(self) -> bool:

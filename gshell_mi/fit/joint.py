@@ -121,6 +121,13 @@ class JointStage:
                                                          self.config.ghost_min_area)
         self.parameters.update()
 
+    def outcome(self) -> dict[str, np.ndarray]:
+        """What a stage on a finer lattice starts from, as host arrays, after ``finish``."""
+        fields = self.subject.fields()
+        arrays = {"sdf": fields.sdf, "msdf": fields.msdf, "deform": fields.deform}
+        arrays |= {name: field.numpy() for name, field in self.material.parameters.items()}
+        return arrays | ({"log_radiance": self.light.log_radiance.numpy()} if self.light else {})
+
     def preview(self) -> Preview:
         """The mesh of the last step in its base colour."""
         surface = self.subject.surface

@@ -19,7 +19,7 @@ from ..fields.interpolation import Interpolation
 from ..fields.lattice_fields import closed_at_border
 from ..fields.thin_parts import thickened, thin_part_refinement
 from ..fields.visual_hull import visual_hull
-from ..lattice import CubeLattice, make_lattice
+from ..lattice import CubeLattice, Lattice, make_lattice
 from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
 from ..scene import load_fit_scene
@@ -132,6 +132,9 @@ class _Fit:
         # Given fields may have detail that no coarser lattice holds.
         coarse = last.resolution if self.scene.subject.filename else config.start_resolution
         self.lattice = make_lattice(EARLY_GRIDS[last.grid], min(last.resolution, coarse))
+        # Networks are not tied to a lattice: theirs is the last one from the start.
+        steps = config.iterations and config.detail_iterations and config.field == "explicit"
+        self.joint_lattice = make_lattice(last.grid, self.lattice.resolution) if steps else last
         self.pixels = PixelPool(self.views, self.scene.targets)
         # Nothing of an earlier fit goes before all is known to be in order.
         make_output_folder(output, keep=resume)
@@ -338,20 +341,29 @@ class _Fit:
         return known, unknown
 
     def _joint(self) -> JointStage:
+        """The joint stage on the lattice that the fit ends on; on a coarser one first, if there is one."""
+        if self.joint_lattice == self.last_lattice:
+            return self._joint_stage("joint", self.last_lattice, self.config)
+        if self.checkpoint.stage in ("field", "joint"):
+            coarse = self._joint_stage("joint", self.joint_lattice, self.config)
+            self.books.enter("detail", **coarse.outcome(), light=self.checkpoint.arrays["light"])
+        return self._joint_stage("detail", self.last_lattice, self.config.for_detail())
+
+    def _joint_stage(self, name: str, lattice: Lattice, config: FitConfig) -> JointStage:
         start = dict(self.checkpoint.arrays)
-        fields = start_fields(start, self.last_lattice, self.config)
+        fields = start_fields(start, lattice, config)
         self.scene.subject.set_fields(fields)
-        joint = JointStage(self.scene, start_material(self.scene, start, fields.lattice, self.config),
-                           start_light(self.scene, start, self.config), self.config)
+        joint = JointStage(self.scene, start_material(self.scene, start, fields.lattice, config),
+                           start_light(self.scene, start, config), config)
         self._fit_field(joint)
-        if self.checkpoint.stage == "joint":
-            self.books.iterate("joint", self.config.iterations, joint, joint.optimizers, start,
+        if self.checkpoint.stage == name:
+            self.books.iterate(name, config.iterations, joint, joint.optimizers, start,
                                lambda: block_arrays(self.scene.subject.fields()))
         else:
-            for name, optimizer in joint.optimizers.items():
-                restore_optimizer(name, optimizer, self.checkpoint.arrays)
+            for optimizer_name, optimizer in joint.optimizers.items():
+                restore_optimizer(optimizer_name, optimizer, self.checkpoint.arrays)
         joint.finish()
-        if self.checkpoint.stage == "joint":
+        if self.checkpoint.stage == name and lattice == self.last_lattice:
             self.books.leave()
         return joint
 

@@ -77,10 +77,13 @@ def block_arrays(fields: LatticeFields) -> dict[str, np.ndarray]:
 
 def start_material(scene: FitScene, arrays: Mapping[str, np.ndarray], lattice: Lattice | BlockLattice,
                    config: FitConfig) -> MaterialField | GivenMaterial:
-    """The scene's own material or, as a field, what is known of it and the colours that the ghost saw."""
+    """The scene's own material or, as a field, what a joint stage has left of it, or what is known of it and
+    the colours that the ghost saw."""
     given = given_material(scene.bsdf)
     if config.material_is_given:
         return GivenMaterial(lattice.vertex_count, **given)
+    if "vertex_color" in arrays:
+        return _resampled_material(arrays, lattice)
     radiance, known = arrays["radiance"], arrays["known"]
     seen_on = lattice_of(lattice.grid, len(known))
     if seen_on != lattice:
@@ -94,10 +97,24 @@ def start_material(scene: FitScene, arrays: Mapping[str, np.ndarray], lattice: L
     return MaterialField(reflectance, **given)
 
 
+def _resampled_material(arrays: Mapping[str, np.ndarray], lattice: Lattice | BlockLattice) -> MaterialField:
+    """The material that a joint stage has left on another lattice."""
+    before = lattice_of(lattice.grid, arrays["sdf"].size)
+    points = lattice.points(mi.Float)
+    material = MaterialField(np.full((lattice.vertex_count, 3), TYPICAL_REFLECTANCE))
+    material.parameters = {name: Interpolation(mi.Float(arrays[name]), before)(points)
+                           for name in material.parameters}
+    return material
+
+
 def start_light(scene: FitScene, arrays: Mapping[str, np.ndarray],
                 config: FitConfig) -> EnvironmentLight | None:
-    """The map to optimise: the scene's, or an even one as bright as the object; None keeps the scene's."""
+    """The map to optimise: what a joint stage has left, the scene's, or an even one as bright as the object;
+    None keeps the scene's."""
     if config.light_is_given:
         return None
-    return (EnvironmentLight.from_emitter(scene.light, config.light_height)
-            or EnvironmentLight.uniform(config.light_height, float(arrays["light"])))
+    light = (EnvironmentLight.from_emitter(scene.light, config.light_height)
+             or EnvironmentLight.uniform(config.light_height, float(arrays["light"])))
+    if "log_radiance" in arrays:
+        light.log_radiance = mi.TensorXf(arrays["log_radiance"])
+    return light

@@ -108,7 +108,7 @@ def test_a_fit_in_blocks_is_resumed(bowl_scene, tmp_path, monkeypatch):
     output = tmp_path / "out"
     command = [str(bowl_scene), "-o", str(output), "--quiet", *SHORT, *CLOSED, "--resolution", "40",
                "--start-resolution", "16", "--band-resolution", "32", "--checkpoint-seconds", "0",
-               "--iterations", "4"]
+               "--iterations", "2", "--detail-iterations", "4"]
     step = JointStage.step
 
     def stopped(self, iteration):
@@ -122,7 +122,7 @@ def test_a_fit_in_blocks_is_resumed(bowl_scene, tmp_path, monkeypatch):
     assert main(command) == 130
     monkeypatch.setattr(JointStage, "step", step)
     kept = Checkpoint.load(output / "checkpoint.npz")
-    assert (kept.stage, kept.iteration) == ("joint", 2) and len(kept.arrays["sdf"]) == 17**3
+    assert (kept.stage, kept.iteration) == ("detail", 2) and len(kept.arrays["sdf"]) == 17**3
     assert len(kept.arrays["geometry/sdf/value"]) == len(kept.arrays["band/sdf"]) < 41**3
     assert main([*command, "--resume"]) == 0
     assert (output / "mesh.ply").is_file()

@@ -1,0 +1,83 @@
+"""The detail stage: the joint stage continued on a finer lattice."""
+
+import json
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from bowl import CLOSED, RADIUS, SHORT
+
+from gshell_mi.fields import LatticeFields
+from gshell_mi.fit import FitConfig
+from gshell_mi.fit.__main__ import main
+from gshell_mi.fit.joint import JointStage
+from gshell_mi.fit.start import start_fields, start_light, start_material
+from gshell_mi.lattice import FlexiCubesLattice
+from gshell_mi.light import EnvironmentLight
+from gshell_mi.material import MaterialField
+from gshell_mi.scene import load_fit_scene
+
+CONFIG = FitConfig(spp=1, primal_spp=1, max_depth=2, light_height=4, band_resolution=32)
+
+
+@pytest.mark.parametrize("resolution", [30, 40], ids=["whole lattice", "blocks"])
+def test_it_starts_with_what_the_joint_stage_has_left(bowl_scene, resolution):
+    fit, lattice = load_fit_scene(bowl_scene), FlexiCubesLattice(20)
+    points = lattice.vertex_positions()
+    deform = np.sin(3 * points[:, [1, 2, 0]])
+    moved = points + lattice.max_offset * deform
+    fields = LatticeFields((np.linalg.norm(moved, axis=1) - RADIUS).astype(np.float32),
+                           (0.1 - moved[:, 1]).astype(np.float32), deform.astype(np.float32).ravel(),
+                           "flexicubes")
+    fit.subject.set_fields(fields)
+    light = EnvironmentLight.uniform(4, 1.0)
+    light.log_radiance = mi.TensorXf(np.random.default_rng(0).normal(size=(4, 8, 3)).astype(np.float32))
+    material = MaterialField(0.5 + 0.2 * points, roughness=0.3, metallic=0.7)
+    joint = JointStage(fit, material, light, CONFIG)
+    joint.finish()
+    left = joint.outcome() | {"light": np.float32(1)}
+
+    finer = FlexiCubesLattice(resolution)
+    start = start_fields(left, finer, CONFIG)
+    assert (start.blocks is None) == (resolution < CONFIG.band_resolution)
+    fit.subject.set_fields(start)
+    vertices = fit.subject.surface.to_numpy()[0]
+    assert np.abs(np.linalg.norm(vertices, axis=1) - RADIUS).mean() < 0.05 * lattice.spacing
+    assert vertices[:, 1].max() == pytest.approx(0.1, abs=0.1 * lattice.spacing)
+    values = start_material(fit, left, start.lattice, CONFIG).values()
+    np.testing.assert_allclose(values["vertex_roughness"].numpy(), 0.3, atol=1e-3)
+    np.testing.assert_allclose(values["vertex_metallic"].numpy(), 0.7, atol=1e-3)
+    color = values["vertex_color"].numpy().reshape(-1, 3)
+    inside = start.lattice.points(mi.Float).numpy().T
+    inside = np.abs(inside).max(axis=1) <= 1
+    expected = 0.5 + 0.2 * start.lattice.points(mi.Float).numpy().T
+    np.testing.assert_allclose(color[inside], expected[inside], atol=5e-3)
+    np.testing.assert_array_equal(start_light(fit, left, CONFIG).log_radiance.numpy(),
+                                  light.log_radiance.numpy())
+
+
+def test_its_rates_are_those_of_what_has_settled():
+    before = FitConfig(iterations=260, detail_iterations=7)
+    after = before.for_detail()
+    assert (after.iterations, after.warmup) == (7, 0)
+    assert after.material_lr < before.material_lr and after.light_lr < before.light_lr
+    assert replace(after, iterations=260, warmup=before.warmup, material_lr=before.material_lr,
+                   light_lr=before.light_lr) == before
+
+
+@pytest.mark.parametrize(("arguments", "stages"), [
+    (("--iterations", "2", "--detail-iterations", "3"), {"joint": 2, "detail": 3}),
+    (("--iterations", "2", "--detail-iterations", "0"), {"joint": 2}),
+    (("--iterations", "0"), {}),
+    (("--iterations", "2", "--field", "multiresolution"), {"joint": 2}),
+    (("--iterations", "2", "--start-resolution", "24"), {"joint": 2}),
+])
+def test_when_there_is_one(bowl_scene, tmp_path, arguments, stages):
+    command = [str(bowl_scene), "-o", str(tmp_path), "--quiet", *SHORT, *CLOSED, "--start-resolution", "16",
+               "--resolution", "24", *arguments]
+    assert main(command) == 0
+    log = [json.loads(line)["stage"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert {stage: log.count(stage) for stage in ("joint", "detail") if stage in log} == stages
+    seconds = json.loads((tmp_path / "metrics.json").read_text())["seconds"]
+    assert ("detail" in seconds) == ("detail" in stages)
