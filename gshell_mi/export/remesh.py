@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..errors import UserError
-from ..topology import topology
+from ..topology import mesh_edges, topology
 
 _PASSES = 10
 
@@ -102,20 +102,15 @@ def _remesh_once(vertices: np.ndarray, faces: np.ndarray, edge_length: float, re
     return v, f
 
 
-def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(E, 2) edges, the lower vertex first, and the number of faces of each."""
-    return np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
-
-
 def _boundary_vertices(faces: np.ndarray, count: int) -> np.ndarray:
-    edges, uses = _edges(faces)
+    edges, uses = mesh_edges(faces)
     found = np.zeros(count, bool)
     found[edges[uses == 1]] = True
     return found
 
 
 def _short_boundary_edges(v: np.ndarray, f: np.ndarray, length: float) -> np.ndarray:
-    edges, uses = _edges(f)
+    edges, uses = mesh_edges(f)
     edges = edges[uses == 1]
     lengths = np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1)
     return edges[np.argsort(lengths)][: (lengths < length).sum()]
@@ -152,7 +147,7 @@ def _collapse_once(v: np.ndarray, f: np.ndarray, edges: np.ndarray,
     edge does too. It must not turn a triangle over either.
     """
     boundary = _boundary_vertices(f, len(v))
-    all_edges, uses = _edges(f)
+    all_edges, uses = mesh_edges(f)
     boundary_edges = set(map(tuple, all_edges[uses == 1].tolist()))
     order = np.argsort(f.ravel(), kind="stable")
     ends = np.searchsorted(f.ravel()[order], np.arange(len(v) + 1))
@@ -215,7 +210,7 @@ def _trim(v: np.ndarray, f: np.ndarray, min_quality: float) -> tuple[np.ndarray,
     two boundary edges, and those with one whose third vertex lies inside."""
     while True:
         boundary = _boundary_vertices(f, len(v))
-        edges, uses = _edges(f)
+        edges, uses = mesh_edges(f)
         at_boundary = uses[_edge_index(edges, f)] == 1
         ears = at_boundary.sum(1) == 2
         opposite = np.take_along_axis(f, (at_boundary.argmax(1)[:, None] + 2) % 3, axis=1)[:, 0]

@@ -103,13 +103,14 @@ class FitConfig:
     """Adam's step for the radiance, as a fraction of the targets' mean."""
 
     # --- photometric refinement: moves the surface inside the hull
-    refinement_iterations: int = 320
+    refinement_iterations: int = 640
     """Steps of the photometric refinement; 0 keeps the hull's shape."""
-    refinement_lr: float = 0.15
+    refinement_lr: float = 0.3
     """Largest movement of a vertex per step, in cells; falls to 0 like a cosine."""
-    refinement_smoothing: float = 400.0
-    """Lambda of the Sobolev gradient on the template when it starts to move: whole parts move first."""
-    refinement_detail: float = 150.0
+    refinement_smoothing: float = 95.0
+    """Lambda of the Sobolev gradient on the template when it starts to move, in square cells: whole parts
+    move first."""
+    refinement_detail: float = 11.0
     """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
     refinement_radiance_lr: float = 0.05
     """Adam's step for the radiance meanwhile."""
@@ -131,6 +132,9 @@ class FitConfig:
     field: Literal["explicit", "multiresolution", "hashgrid", "sinusoidal"] = "explicit"
     """What the geometry is optimised as: the lattice's values themselves, sums of grids of several
     resolutions, a hash grid with a small network, or a sinusoidal network."""
+    flexicubes_weights: bool = False
+    """Also optimise the 21 weights per cube of FlexiCubes, which makes a step slower by a tenth; the hat is
+    none the better for it."""
     iterations: int = 260
     """Steps of the joint stage."""
     warmup: float = 0.15

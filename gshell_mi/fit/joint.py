@@ -56,7 +56,10 @@ class JointStage:
         self._integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
                                          "reparam_depth": config.reparam_depth, "hide_emitters": True})
         self._diffuse = LatticeDiffusion(self.subject.lattice)
-        moving = [name for name in self.subject.field_names if name != "msdf" or not config.watertight]
+        resting = {"msdf"} if config.watertight else set()
+        if not config.flexicubes_weights:
+            resting.add("weights")
+        moving = [name for name in self.subject.field_names if name not in resting]
         start = {name: self.parameters[f"subject.{name}"] for name in moving}
         rules = StepRules(config.geometry_lr, config.deform_lr, config.geometry_smoothing,
                           config.geometry_detail)

@@ -20,7 +20,7 @@ _PER_VERTEX = 490  # of the lattice: fields and material, their Adam moments and
 _PER_HULL_SAMPLE = 75  # of the visual hull, which is finer than the lattice, and ...
 _PER_VOTE = 4  # ... what it keeps there per view that has to see daylight
 _PER_SQUARE_CELL = 37_000  # resolution squared, as the surface grows: meshes, edge lists, derivatives
-_PER_WEIGHT = 20  # of FlexiCubes: its gradient and Adam's moments, too ...
+_PER_WEIGHT = 20  # of FlexiCubes, if they are optimised: its gradient and Adam's moments, too ...
 _WEIGHTS_PER_SQUARE_CELL = 900  # ... where only blocks around the surface have some
 _PER_SAMPLE = 50  # of a rendered image
 
@@ -60,7 +60,8 @@ class MemoryEstimate:
         True
         """
         # Fields in blocks follow the surface.
-        whole, weights = resolution, make_lattice(grid, resolution).weight_count
+        whole = resolution
+        weights = make_lattice(grid, resolution).weight_count if config.flexicubes_weights else 0
         if resolution >= config.band_resolution and make_lattice(grid, 1).fits_in_blocks:
             whole = min(resolution, config.start_resolution)
             weights = min(weights, _WEIGHTS_PER_SQUARE_CELL * resolution**2)

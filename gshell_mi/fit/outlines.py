@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.visual_hull import mask_distance
+from ..topology import mesh_edges
 from ..views import PinholeViews
 from .mesh_normals import vertex_normals
 
@@ -34,8 +35,7 @@ class Outlines:
         self.views = views
         self._faces = mi.Vector3u(faces.T.astype(np.uint32))
         self._vertex_count = len(solid)
-        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        edges = np.unique(np.sort(edges, axis=1), axis=0)
+        edges, _ = mesh_edges(faces)
         edges = edges[solid[edges].all(axis=1)]
         self._edges = mi.Vector2u(edges.T.astype(np.uint32))
         self._edge_count = len(edges)

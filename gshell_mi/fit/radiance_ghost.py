@@ -33,6 +33,9 @@ _INITIAL_LOGIT = float(np.log(0.35 / 0.65))
 #: Logit of a vertex that is taken to be opaque (its negative: to be open).
 _CERTAIN_LOGIT = 8.0
 
+#: Transmittance below which nothing further along a ray is looked for.
+_NEGLIGIBLE = 1e-3
+
 #: Smoothed logits are limited to this.
 _LOGIT_LIMIT = 3.0
 
@@ -83,6 +86,7 @@ class RadianceGhost:
                 self.optimizer[name] = values
             self._normals = self._smooth_normals()
         self._set_opacity(np.full(self.vertex_count, _INITIAL_LOGIT))
+        self._opacity_rests = False
 
     def step(self, iteration: int) -> dict[str, float]:
         """One Adam step on a batch of random pixels; returns the losses."""
@@ -119,6 +123,7 @@ class RadianceGhost:
     def refit(self, opaque: np.ndarray) -> None:
         """Fits the radiance alone, with the vertices ``opaque`` (V,) opaque and the others open."""
         self._set_opacity(np.where(opaque, _CERTAIN_LOGIT, -_CERTAIN_LOGIT))
+        self._opacity_rests = True
         for step in range(_REFIT_STEPS):
             sample, radiance, _, _ = self._render(_EXTRA_STEP + step)
             dr.backward(losses.l1(self._tone(radiance), self._tone(sample.radiance)))
@@ -222,9 +227,14 @@ class RadianceGhost:
         return Preview(vertices, faces[kept[faces].all(axis=1)], self.radiance()[0], vertices, faces)
 
     def sheets(self, ray: mi.Ray3f) -> list[tuple]:
-        """The first sheets along each ray: (hit?, vertex indices, barycentric weights, front side?)."""
+        """The first sheets along each ray: (hit?, vertex indices, barycentric weights, front side?).
+
+        There are none behind sheets that let nothing through, unless their opacity is still to be found: for
+        that, what they hide counts as well.
+        """
         sheets = []
-        active = dr.full(mi.Bool, True, dr.width(ray.o))
+        opacity = dr.detach(self.optimizer["opacity"])
+        active, transmittance = dr.full(mi.Bool, True, dr.width(ray.o)), mi.Float(1)
         for _ in range(self.config.ghost_sheets):
             hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
             active = hit.is_valid()
@@ -234,7 +244,11 @@ class RadianceGhost:
             front = dr.dot(dr.cross(b - a, c - a), ray.d) < 0
             # Barycentrics of a miss are not a number, and 0 times that is no 0.
             uv = dr.select(active, hit.prim_uv, 0)
-            sheets.append((active, face, mi.Vector3f(1 - uv.x - uv.y, uv.x, uv.y), front))
+            weights = mi.Vector3f(1 - uv.x - uv.y, uv.x, uv.y)
+            sheets.append((active, face, weights, front))
+            transmittance *= 1 - sigmoid(_interpolated(opacity, face, weights, active))
+            if self._opacity_rests:
+                active = active & (transmittance > _NEGLIGIBLE)
             ray = mi.Ray3f(ray.o + ray.d * dr.select(active, hit.t + self._offset, 0), ray.d)
         dr.eval(sheets)
         return sheets
@@ -250,9 +264,8 @@ class RadianceGhost:
         radiance, transmittance = mi.Color3f(0), mi.Float(1)
         for sheet in sheets:
             hit, face, weights, is_front = sheet
-            logit, color = mi.Float(0), mi.Color3f(0)
+            logit, color = _interpolated(opacity, face, weights, hit), mi.Color3f(0)
             for weight, corner in zip(weights, face, strict=True):
-                logit += weight * dr.gather(mi.Float, opacity, corner, hit)
                 for side, seen in zip(SIDES, (hit & is_front, hit & ~is_front), strict=True):
                     color += weight * dr.gather(mi.Color3f, self.optimizer[side], corner, seen)
             alpha = dr.select(hit, sigmoid(logit), 0)
@@ -280,3 +293,9 @@ class RadianceGhost:
         """(3 V,) unit normals, as smooth as the other values at the vertices."""
         normals = dr.unravel(mi.Vector3f, self._smooth(vertex_normals(self._positions, self._faces)))
         return dr.ravel(normals / dr.maximum(dr.norm(normals), 1e-12))
+
+
+def _interpolated(values: mi.Float, face: mi.Vector3u, weights: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    """One value per vertex at the points that the barycentric weights give."""
+    return sum(weight * dr.gather(mi.Float, values, corner, active)
+               for weight, corner in zip(weights, face, strict=True))

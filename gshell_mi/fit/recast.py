@@ -127,6 +127,7 @@ def thickened(before: np.ndarray, moved: np.ndarray, faces: np.ndarray, solid: n
     Returns:
         (V, 3) positions.
     """
+    smooth = MeshDiffusion(faces, len(moved), _SMOOTHING)
     for _ in range(_PASSES):
         normals = normals_at_vertices(moved, faces)
         thickness, opposite = opposite_sides(before, moved, faces, cell)
@@ -134,7 +135,7 @@ def thickened(before: np.ndarray, moved: np.ndarray, faces: np.ndarray, solid: n
         share = np.where(solid, np.where(other, 0.5, 0.0), np.where(other, 1.0, 0.5))
         wanted = np.where(solid & other, _SOLID_THICKNESS, np.where(other, _SLAB, _THICKNESS))
         growth = np.clip(wanted * cell - thickness, 0, None) * share
-        growth = MeshDiffusion(faces, len(moved), _SMOOTHING)(mi.Float(growth.astype(np.float32))).numpy()
+        growth = smooth(mi.Float(growth.astype(np.float32))).numpy()
         # Smoothing must not move the side that counts.
         growth[solid & ~other] = 0
         moved = moved + growth[:, None] * normals

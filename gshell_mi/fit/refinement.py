@@ -24,7 +24,7 @@ from .radiance_ghost import SIDES, RadianceGhost
 _OUTLINE_VIEWS = 8
 
 #: Steps after which the Sobolev gradient is factorised with the lambda of the day.
-_FACTORISE_EVERY = 25
+_FACTORISE_EVERY = 64
 
 
 class PhotometricRefinement:
@@ -43,6 +43,10 @@ class PhotometricRefinement:
                  outlines: Outlines | None, length: float, config: FitConfig):
         self.ghost, self.faces, self.outlines, self.config = ghost, faces, outlines, config
         self.length = length
+        a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+        #: Vertices per square cell: what turns a lambda of cells into one of edges.
+        self._density = len(vertices) * length**2 / area
         # One step size for all vertices: what little noise moves must not move as far as the rest.
         self.optimizer = mi.ad.Adam(lr=length, beta_2=0.99, uniform=True)
         self.optimizer["positions"] = mi.Float(vertices.ravel().astype(np.float32))
@@ -85,7 +89,7 @@ class PhotometricRefinement:
         if self._diffuse is None or iteration % _FACTORISE_EVERY == 0:
             start = (iteration - iteration % _FACTORISE_EVERY) / config.refinement_iterations
             smoothing = falling(config.refinement_smoothing, config.refinement_detail, start)
-            self._diffuse = MeshDiffusion(self.faces, self.ghost.vertex_count, smoothing)
+            self._diffuse = MeshDiffusion(self.faces, self.ghost.vertex_count, self._density * smoothing)
         gradient = dr.grad(optimizer["positions"])
         gradient = self._diffuse(dr.select(dr.isfinite(gradient), gradient, 0))
         dr.set_grad(optimizer["positions"], gradient)

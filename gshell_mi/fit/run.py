@@ -132,9 +132,11 @@ class _Fit:
         # Given fields may have detail that no coarser lattice holds.
         coarse = last.resolution if self.scene.subject.filename else config.start_resolution
         self.lattice = make_lattice(EARLY_GRIDS[last.grid], min(last.resolution, coarse))
+        # The same vertices, but joined as in the end.
+        self.late_lattice = make_lattice(last.grid, self.lattice.resolution)
         # Networks are not tied to a lattice: theirs is the last one from the start.
         steps = config.iterations and config.detail_iterations and config.field == "explicit"
-        self.joint_lattice = make_lattice(last.grid, self.lattice.resolution) if steps else last
+        self.joint_lattice = self.late_lattice if steps else last
         self.pixels = PixelPool(self.views, self.scene.targets)
         # Nothing of an earlier fit goes before all is known to be in order.
         make_output_folder(output, keep=resume)
@@ -271,7 +273,7 @@ class _Fit:
     def _refine(self) -> None:
         """Moves the template inside the hull, and the fields with it."""
         state = self.checkpoint.arrays
-        template = ghost_template(self.scene.subject, state, self.lattice)
+        template = ghost_template(self.scene.subject, state, self.late_lattice)
         # Without a refinement, what was grown for being thin shrinks back.
         moved, kept = template.start, False
         radiance = template.mesh.interpolate(mi.Float(state["radiance"].ravel()), 3).numpy().T
@@ -280,8 +282,6 @@ class _Fit:
         fields = None
         if (moved != template.vertices).any():
             with self.books.timed("refinement"):
-                # From here on the surface is drawn as in the joint stage, from values at the same vertices.
-                self.scene.subject.set_fields(LatticeFields.closed(state["sdf"], self.last_lattice.grid))
                 for cut in self._cuts(template, moved):
                     fields = recast(self.scene.subject, template.vertices, cut.positions, template.faces,
                                     cut.logits, radiance, self.config.ghost_min_area, cut.topology)

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.smoothing import MeshDiffusion
-from ..topology import Topology, vertex_components
+from ..topology import Topology, mesh_edges, vertex_components
 from .template_sides import normals_at_vertices, opposite_sides
 
 #: Parts are thin up to this thickness, in cells.
@@ -101,7 +101,7 @@ def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray
     Returns:
         (V,) whether a vertex may be opened too, and how many parts without an opening are sheets.
     """
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    edges, _ = mesh_edges(faces)
     facing_away = np.einsum("nj,nj->n", normals, normals[opposite]) < -_FLAT
     thin = solid & solid[opposite] & (thickness < _THIN * cell) & facing_away
     part = vertex_components(edges, len(solid))[1]

@@ -9,6 +9,7 @@ import numpy as np
 from ..export.asset import y_up_turn
 from ..export.gltf import Part, glb_bytes, read_part
 from ..export.ply import read_ply
+from ..topology import mesh_edges
 from ..turntable.looks import ORANGE
 
 _TUBE_SIDES = 5
@@ -55,8 +56,7 @@ def back_faces(positions: np.ndarray, normals: np.ndarray, faces: np.ndarray) ->
 def boundary_tubes(vertices: np.ndarray, faces: np.ndarray,
                    radius: float) -> tuple[np.ndarray, np.ndarray] | None:
     """Thin open prisms along the boundary edges: vertices and faces; None for closed meshes."""
-    edges, uses = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0,
-                            return_counts=True)
+    edges, uses = mesh_edges(faces)
     edges = edges[uses == 1]
     if len(edges) == 0:
         return None

@@ -56,8 +56,8 @@ def test_the_surroundings_have_no_seam():
 
 RADIUS, SIZE = 0.5, 48
 CELL = 2 / 32
-CONFIG = FitConfig(ghost_batch=8192, ghost_smoothing=1.0, refinement_iterations=80, refinement_smoothing=20.0,
-                   refinement_detail=10.0, refinement_lr=0.2)
+CONFIG = FitConfig(ghost_batch=8192, ghost_smoothing=1.0, refinement_iterations=80, refinement_smoothing=6.3,
+                   refinement_detail=3.1, refinement_lr=0.2)
 
 
 def cameras() -> list[mi.Sensor]:

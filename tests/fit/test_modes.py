@@ -129,11 +129,14 @@ def test_watertight_closes_given_openings(scene, tmp_path):
     assert metrics["counts"]["boundary_loops"] == 0
 
 
-def test_all_modes_at_once_resume(scene, tmp_path):
-    """Nothing but sdf and deform is optimised then, and a checkpoint knows how to go on."""
+@pytest.mark.parametrize("weights", [False, True])
+def test_all_modes_at_once_resume(scene, tmp_path, weights):
+    """Nothing but sdf, deform and, if asked for, weights is optimised; a checkpoint knows how to go on."""
     output = tmp_path / "out"
-    modes = ("--watertight", "--known-light", "--fixed-material", "--refinement-iterations", "0")
+    modes = ("--watertight", "--known-light", "--fixed-material", "--refinement-iterations", "0",
+             *["--flexicubes-weights"] * weights)
     fit(scene, output, *modes, "--iterations", "2")
     stored = np.load(output / "checkpoint.npz")
-    assert {name.split("/")[1] for name in stored.files if "/" in name} == {"sdf", "deform", "weights"}
+    optimised = {"sdf", "deform", "weights"} if weights else {"sdf", "deform"}
+    assert {name.split("/")[1] for name in stored.files if "/" in name} == optimised
     fit(scene, output, *modes, "--iterations", "2", "--resume")

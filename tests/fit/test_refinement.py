@@ -15,8 +15,8 @@ from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
 
 RADIUS, SIZE = 0.5, 48
-CONFIG = FitConfig(ghost_batch=8192, ghost_smoothing=1.0, refinement_iterations=60, refinement_smoothing=20.0,
-                   refinement_detail=5.0, refinement_lr=0.3)
+CONFIG = FitConfig(ghost_batch=8192, ghost_smoothing=1.0, refinement_iterations=60, refinement_smoothing=6.3,
+                   refinement_detail=1.6, refinement_lr=0.3)
 CELL = 2 / 32
 
 
