@@ -103,14 +103,14 @@ class FitConfig:
     """Adam's step for the radiance, as a fraction of the targets' mean."""
 
     # --- photometric refinement: moves the surface inside the hull
-    refinement_iterations: int = 640
+    refinement_iterations: int = 480
     """Steps of the photometric refinement; 0 keeps the hull's shape."""
-    refinement_lr: float = 0.3
+    refinement_lr: float = 0.2
     """Largest movement of a vertex per step, in cells; falls to 0 like a cosine."""
     refinement_smoothing: float = 95.0
     """Lambda of the Sobolev gradient on the template when it starts to move, in square cells: whole parts
     move first."""
-    refinement_detail: float = 11.0
+    refinement_detail: float = 34.0
     """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
     refinement_radiance_lr: float = 0.05
     """Adam's step for the radiance meanwhile."""
