@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -84,7 +85,7 @@ class LatticeFields:
             return LatticeFields(self.sdf, self.msdf, self.deform, self.grid)
         import mitsuba as mi
 
-        fields = self._at(new.points(mi.Float), new.max_offset)
+        fields = self._resampler(new)(new.points(mi.Float))
         return LatticeFields(**{name: field.numpy() for name, field in fields.items()}, grid=new.grid)
 
     def in_blocks(self, resolution: int | None = None) -> LatticeFields:
@@ -95,19 +96,19 @@ class LatticeFields:
         import mitsuba as mi
 
         old, new = self.lattice, make_lattice(self.grid, resolution or self.lattice.resolution)
-        given = {name: mi.Float(getattr(self, name)) for name in ("sdf", "msdf", "deform")}
         if new == old:
+            given = {name: mi.Float(getattr(self, name)) for name in ("sdf", "msdf", "deform")}
             blocks = BlockLattice.around(old, given["sdf"])
             fields = {name: blocks.take(field) for name, field in given.items()}
         else:
-            blocks = BlockLattice.around(new, lambda points: self._at(points, new.max_offset)["sdf"],
-                                         mi.Float)
-            fields = self._at(blocks.points(mi.Float), new.max_offset)
+            resampled = self._resampler(new)
+            blocks = BlockLattice.around(new, lambda points: resampled(points)["sdf"], mi.Float)
+            fields = resampled(blocks.points(mi.Float))
         return LatticeFields(**{name: field.numpy() for name, field in fields.items()}, grid=self.grid,
                              blocks=blocks.blocks.numpy(), block_resolution=new.resolution)
 
-    def _at(self, points: Any, max_offset: float) -> dict[str, Any]:
-        """The fields that another lattice has at its vertices ``points`` for the surface to stay in place."""
+    def _resampler(self, lattice: Lattice) -> Callable[[Any], dict[str, Any]]:
+        """From vertices of another lattice to its fields there, such that the surface stays in place."""
         import drjit as dr
         import mitsuba as mi
 
@@ -119,13 +120,16 @@ class LatticeFields:
         def offset(vertices: mi.Point3f) -> mi.Vector3f:
             return self.lattice.max_offset * mi.Vector3f(at["deform"].channels(vertices))
 
-        limited = dr.clip(offset(points) / max_offset, -1, 1)
-        # Where the offset is cut short, the values are those of another point, which is found step by step.
-        source, goal = mi.Point3f(points), points + max_offset * limited
-        for _ in range(_FIXED_POINT_STEPS):
-            source = goal - offset(source)
-            dr.eval(source)
-        return {"sdf": at["sdf"](source), "msdf": at["msdf"](source), "deform": dr.ravel(limited)}
+        def resampled(points: mi.Point3f) -> dict[str, mi.Float]:
+            limited = dr.clip(offset(points) / lattice.max_offset, -1, 1)
+            # Where the offset is cut short, the values are those of another point, found step by step.
+            source, goal = mi.Point3f(points), points + lattice.max_offset * limited
+            for _ in range(_FIXED_POINT_STEPS):
+                source = goal - offset(source)
+                dr.eval(source)
+            return {"sdf": at["sdf"](source), "msdf": at["msdf"](source), "deform": dr.ravel(limited)}
+
+        return resampled
 
     def save(self, path: str | Path) -> None:
         """Writes a compressed .npz with the arrays ``sdf``, ``msdf``, ``deform`` and, if any, the others."""

@@ -1,4 +1,5 @@
-"""The fit from start to end, with checkpoints: hull, ghost, carving, refinement, joint stage, export."""
+"""The fit from start to end, with checkpoints: hull, ghost, carving, refinement, joint and detail stage,
+export."""
 
 from __future__ import annotations
 
