@@ -209,7 +209,7 @@ def _fitted_msdf(
     lattice = fields.lattice
     template = extract(lattice, mi.Float(fields.sdf))
     edges = template.to_numpy()[1][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    wanted, beside_rim = _rim_distance(template, lattice, feet_of, nearest, rim, edges)
+    wanted, beside_rim, cut = _rim_distance(template, lattice, feet_of, nearest, rim, edges)
     entries = [tuple(np.array(x) for x in entry) for entry in dr.detach(template.stencil.entries())]
     row, column, weight = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     used, column = np.unique(column, return_inverse=True)
@@ -226,10 +226,16 @@ def _fitted_msdf(
         values, _ = cg(normal.tocsr(), right, x0=values, rtol=1e-4, maxiter=150, M=jacobi)
         found = interpolate @ values
         speck = _specks(found, wanted, edges)
+        # A cut between layers that ends within the sheet is a pin-hole: it grows until it meets a cap.
+        short = speck & (found < 0) & _in_patches_of(cut, found, edges)
+        if short.any():
+            speck &= ~short
+            grown = edges[short[edges].any(axis=1)].ravel()
+            cut[grown], wanted[grown] = True, -0.25 * lattice.spacing
         # Where caps and layers share lattice vertices, caps prevail at the rims, so that these do not run
         # into each other, and the mesh elsewhere. Nothing small is left over.
         missed = ((found > 0) != (wanted > 0)) & (beside_rim != (wanted > 0))
-        if not speck.any() and not missed.any():
+        if not speck.any() and not missed.any() and not short.any():
             break
         importance[missed] *= 8
         wanted[speck] = np.where(found[speck] > 0, -0.25, 0.25) * lattice.spacing
@@ -250,8 +256,9 @@ def _fitted_msdf(
 def _rim_distance(
     template: SurfaceMesh, lattice: Lattice, feet_of: MeshFeet, nearest: np.ndarray, rim: np.ndarray,
     edges: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distance to the rims along the mesh at the vertices of the template, and which are near one."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Signed distance to the rims along the mesh at the vertices of the template, which of these are near
+    a rim, and which are cut as they lead from one layer to another."""
     h = lattice.spacing
     vertices = template.to_numpy()[0]
     normals = np.array(dr.detach(template.vertex_normals())).T
@@ -282,8 +289,10 @@ def _rim_distance(
     leaps = bridges(feet_of.mesh, feet, (np.cumsum(known) - 1)[edges[sheet]], _BRIDGE_CELLS * h)
     # They are cut at the end that is nearer to a rim.
     nearer = np.take_along_axis(leaps, inner[leaps].argmin(axis=1)[:, None], axis=1)
-    wanted[np.flatnonzero(known)[nearer]] = -h / 4
-    return np.copysign(np.maximum(np.abs(wanted), 1e-3 * h), wanted), beside_rim
+    cut = np.zeros(len(vertices), bool)
+    cut[np.flatnonzero(known)[nearer]] = True
+    wanted[cut] = -h / 4
+    return np.copysign(np.maximum(np.abs(wanted), 1e-3 * h), wanted), beside_rim, cut
 
 
 def _specks(found: np.ndarray, wanted: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -291,6 +300,12 @@ def _specks(found: np.ndarray, wanted: np.ndarray, edges: np.ndarray) -> np.ndar
     patch = _patches(found > 0, edges)
     size, wrong = np.bincount(patch), np.bincount(patch, (found > 0) != (wanted > 0))
     return ((size < _SPECK) | (wrong > size / 2))[patch]
+
+
+def _in_patches_of(chosen: np.ndarray, found: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Which vertices lie in a patch of one sign that holds a chosen vertex."""
+    patch = _patches(found > 0, edges)
+    return (np.bincount(patch, chosen) > 0)[patch]
 
 
 def _patches(positive: np.ndarray, edges: np.ndarray) -> np.ndarray:
