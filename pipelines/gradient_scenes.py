@@ -140,6 +140,15 @@ def shirt():
     return vertices / np.abs(vertices).max() * 1.2, np.array(mesh.faces)
 
 
+def pleats(count=12):
+    """A sheet folded back and forth, at angles far below 90 degrees."""
+    x, y = np.linspace(-1, 1, count + 1), np.linspace(-0.8, 0.8, 4)
+    row = np.stack([x, 0 * x, 0.25 * (-1.0) ** np.arange(count + 1)], -1)
+    i = (np.arange(3)[:, None] * (count + 1) + np.arange(count)).ravel()
+    faces = [np.stack([i, i + 1, i + count + 2], -1), np.stack([i, i + count + 2, i + count + 1], -1)]
+    return (row + y[:, None, None] * [0, 1, 0]).reshape(-1, 3), np.concatenate(faces)
+
+
 def translation(vertices, direction=(1, 0.5, 0.3)):
     return np.broadcast_to(np.array(direction, float), np.shape(vertices))
 
@@ -167,6 +176,11 @@ def _shirt(motion):
         return (load(camera(resolution, (1.5, 1.5, 4)), sky(), make_mesh("subject", v, f)),
                 translation(v) if motion == "translate" else 0.5 * normals)
     return build
+
+
+def _pleats(resolution):
+    v, f = pleats()
+    return load(camera(resolution, (1.5, 1.5, 4)), sky(), make_mesh("subject", v, f)), translation(v)
 
 
 def _cube(resolution):
@@ -280,6 +294,7 @@ SCENES = (
     GradientScene("sheet_scaling", "open boundary", _sheet("scale")),
     GradientScene("shirt_translating", "open garment, self-shadowed", _shirt("translate")),
     GradientScene("shirt_inflating", "open garment, deforming", _shirt("inflate")),
+    GradientScene("sharp_pleats", "smooth-shaded sharp folds, some faces almost edge-on", _pleats),
     GradientScene("cube_constant", "cube under a constant environment (Mitsuba #1895)", _cube),
     GradientScene("cube_flat_shaded", "creases between flat faces", _flat_cube_sky),
     GradientScene("seam_over_rough_mirror", "texture seam over a rough mirror (#1648)", _seam_over_mirror, 3,

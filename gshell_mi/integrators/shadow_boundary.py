@@ -162,7 +162,7 @@ class _Boundary:
         film = self.sensor.film()
         visible, tolerance = dr.detach(followed.visible), 1e-3
         if not bounce:    # on the face that the light reaches
-            visible = dr.select(cast, visible, visible + 1e-2 * dr.norm(followed.along) * followed.across)
+            visible = dr.select(cast, visible, visible + 1e-3 * dr.norm(followed.along) * followed.across)
         u = project_to_film(self.sensor, visible) / mi.Vector2f(film.crop_size())
         ray, throughput = self.sensor.sample_ray(self.sensor.shutter_open(), 0.0, u, mi.Point2f(0.5))
         si = self.integrator.first_hit(self.scene, ray, followed.valid).compute_surface_interaction(

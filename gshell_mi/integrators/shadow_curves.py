@@ -11,6 +11,9 @@ from .silhouette_edges import project_to_film
 #: Share of the points that are tried as the place where a mesh turns away from the light
 _TURNING = 0.2
 
+#: Sine of half the angle of a wedge; in sharper ones, points are nearer to the sides.
+_SHARPEST = 1e-2
+
 
 @dataclass
 class ShadowPoints:
@@ -81,7 +84,7 @@ class ShadowCurves:
                 scale = dr.norm(dr.detach(shadow) - z) / dr.norm(y_now - z)
             along = dr.select(cast, _slide(along, normal, now) * scale, along)
             across = dr.select(cast, _slide(across, normal, now) * scale, self._lit_side(drawn, now))
-        p = dr.select(cast, shadow, y)
+        p = dr.select(cast, shadow, y - outward)
         lit, valid = dr.detach(p), valid | ~cast
         via = None
         if bounce:
@@ -98,6 +101,14 @@ class ShadowCurves:
         outer = across * dr.cos(high) - inward * dr.sin(high)
         angle = dr.select(dr.dot(outer, towards) > 0, high, dr.gather(mi.Float, self.wedges.low, drawn.edge))
         return inward * dr.cos(angle) + across * dr.sin(angle)
+
+    def _into(self, edge):
+        """Vectors into the wedges of edges, to points a unit away from both sides."""
+        _, _, _, inward, across = self.wedges.frame(edge)
+        low, high = (dr.gather(mi.Float, x, edge) for x in (self.wedges.low, self.wedges.high))
+        middle = 0.5 * (low + high)
+        length = dr.rcp(dr.maximum(dr.sin(0.5 * (high - low)), _SHARPEST))
+        return (inward * dr.cos(middle) + across * dr.sin(middle)) * length
 
     def _next_surface(self, p, direction, lift, active):
         """The next surface from points along a direction: position, attached; normal; whether any."""
@@ -129,7 +140,9 @@ class ShadowCurves:
     def rays(self, drawn, cast, followed, outward):
         """Rays towards the light that pass by the edge, and that its wedge stops."""
         lit = mi.Ray3f(followed.y, drawn.towards(followed.y))
-        inside = followed.y - 2 * outward
+        # Straight in from a sharp edge would be out again on the other side.
+        depth = dr.select(cast, -outward, dr.norm(outward) * self._into(drawn.edge))
+        inside = followed.y - outward + depth
         origin = dr.select(cast, followed.lit, inside)
         direction = dr.select(cast, dr.normalize(inside - followed.lit), drawn.towards(inside))
         origin += direction * dr.select(cast, 1e-4 * (1 + dr.max(dr.abs(origin))), 0)

@@ -13,7 +13,7 @@ from pipelines.surface_differences import SurfaceImage
 
 RESOLUTION = 24
 CASES = {case.name: case for case in scenes.SCENES}
-QUICK = ["sphere_translating", "sheet_scaling", "cube_flat_shaded", "many_flat_faces", "leaving_the_frame",
+QUICK = ["sphere_translating", "sheet_scaling", "sharp_pleats", "cube_flat_shaded", "many_flat_faces", "leaving_the_frame",
          "shadow_point_light", "shadow_directional"]
 
 
@@ -31,7 +31,7 @@ def mean_and_error(x):
     return x.mean(), x.std(ddof=1) / np.sqrt(len(x))
 
 
-def converged(image_of_seed, least, most=200):
+def converged(image_of_seed, least, most=320):
     """Mean and error of the weighted images of as many seeds as an error of 3 % takes, within limits."""
     values = np.array([])
     while len(values) < most:
