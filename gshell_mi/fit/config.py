@@ -103,7 +103,7 @@ class FitConfig:
     """Adam's step for the radiance, as a fraction of the targets' mean."""
 
     # --- photometric refinement: moves the surface inside the hull
-    refinement_iterations: int = 480
+    refinement_iterations: int = 400
     """Steps of the photometric refinement; 0 keeps the hull's shape."""
     refinement_lr: float = 0.2
     """Largest movement of a vertex per step, in cells; falls to 0 like a cosine."""
@@ -120,6 +120,16 @@ class FitConfig:
     refinement_gain: float = 0.9
     """The refinement is kept if it brings the image error of views that it did not see below this fraction.
     Where radiance depends much on the view (gloss), it may explain the views it sees by a wrong shape."""
+
+    folds_iterations: int = 440
+    """Steps of a second round of the refinement, which moves details farther; 0 leaves it out."""
+    folds_lr: float = 0.3
+    """Largest movement of a vertex per step of the second round, in cells; falls to 0 like a cosine."""
+    folds_detail: float = 11.0
+    """Lambda at the end of the second round, which starts with that of the first's end."""
+    folds_gain: float = 0.97
+    """The second round is kept if it brings the image error of unseen views below this fraction. It hollows out
+    pleats; smooth surfaces without texture drift."""
 
     sheet_thickness: float = 0.5
     """Closed parts that are at most so thick, in cells, come out as a single open sheet; 0 keeps both sides
@@ -208,6 +218,11 @@ class FitConfig:
         (3, 0)
         """
         return cls(**_PREVIEW | others)
+
+    def for_folds(self) -> FitConfig:
+        """The settings of the refinement as those of its second round."""
+        return replace(self, refinement_iterations=self.folds_iterations, refinement_lr=self.folds_lr,
+                       refinement_smoothing=self.refinement_detail, refinement_detail=self.folds_detail)
 
     def for_detail(self) -> FitConfig:
         """The settings of the joint stage as those of the detail stage, which begins where that has ended."""

@@ -153,7 +153,7 @@ class _Fit:
                 self._ghost()
             if self.checkpoint.stage == "carving":
                 self._carve()
-            if self.checkpoint.stage == "refinement":
+            if self.checkpoint.stage in ("refinement", "folds"):
                 self._refine()
             joint = self._joint()
             self.interrupt.check()
@@ -317,21 +317,41 @@ class _Fit:
         faces, solid, start = template.faces, template.solid, template.start
         known, unknown = self._split_pixels()
         ghost = RadianceGhost(start, faces, self.views, known, self.config, glossy=True)
-        ghost.refit_anew(solid)
-        unexplained = ghost.unexplained(unknown)
         outlines = None
         if self.pixels.has_alpha:
             alphas = [target.rgba[..., 3] for target in self.scene.targets]
             outlines = Outlines(self.views, alphas, faces, solid)
-        cell = self.scene.subject.cell_size
-        refinement = PhotometricRefinement(ghost, start, faces, outlines, cell, self.config)
-        self.books.iterate("refinement", self.config.refinement_iterations, refinement,
-                           {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
-        with self.books.timed("refinement"):
-            ghost.move(mi.Float(refinement.positions().ravel()))
-            ghost.refit(solid)
-            kept = ghost.unexplained(unknown) < self.config.refinement_gain * unexplained
-        return refinement.positions() if kept else start, ghost.radiance()[0], kept
+
+        def moved(stage: str, positions: np.ndarray, config: FitConfig) -> tuple[np.ndarray, float]:
+            """Positions after a round of the refinement, and the error of the unseen views with them."""
+            refinement = PhotometricRefinement(ghost, positions, faces, outlines,
+                                               self.scene.subject.cell_size, config)
+            self.books.iterate(stage, config.refinement_iterations, refinement,
+                               {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
+            with self.books.timed(stage):
+                ghost.move(mi.Float(refinement.positions().ravel()))
+                ghost.refit(solid)
+                return refinement.positions(), ghost.unexplained(unknown)
+
+        if self.checkpoint.stage == "refinement":
+            ghost.refit_anew(solid)
+            before = ghost.unexplained(unknown)
+            positions, error = moved("refinement", start, self.config)
+            if error >= self.config.refinement_gain * before:
+                return start, ghost.radiance()[0], False
+            if not self.config.folds_iterations:
+                return positions, ghost.radiance()[0], True
+            state = dict(state) | {"positions": positions}
+            self.books.enter("folds", **state)
+        else:
+            positions = state["positions"]
+            ghost.move(mi.Float(positions.ravel()))
+            ghost.refit_anew(solid)
+            error = ghost.unexplained(unknown)
+        radiance = ghost.radiance()[0]
+        farther, error_then = moved("folds", positions, self.config.for_folds())
+        self.checkpoint.facts["folds_kept"] = kept = error_then < self.config.folds_gain * error
+        return (farther, ghost.radiance()[0], True) if kept else (positions, radiance, True)
 
     def _split_pixels(self) -> tuple[PixelPool, PixelPool]:
         """Pixels to learn the shape from, and those of views kept apart to judge it."""
