@@ -24,7 +24,7 @@ from scene_builder import files
 
 CASES = ("32:24:128", "64:24:128", "64:48:256", "128:24:256", "64:12:800")
 SHORT = ("--ghost-iterations", "15", "--ghost-gain", "2", "--carving-iterations", "10",
-         "--refinement-iterations", "6",
+         "--refinement-iterations", "6", "--folds-iterations", "0",
          "--refinement-gain", "9", "--iterations", "12")
 
 

@@ -128,8 +128,8 @@ class FitConfig:
     folds_detail: float = 11.0
     """Lambda at the end of the second round, which starts with that of the first's end."""
     folds_gain: float = 0.97
-    """The second round is kept if it brings the image error of unseen views below this fraction. It hollows out
-    pleats; smooth surfaces without texture drift."""
+    """The second round is kept if it brings the image error of unseen views below this fraction: it hollows
+    out pleats, but smooth surfaces without texture drift."""
 
     sheet_thickness: float = 0.5
     """Closed parts that are at most so thick, in cells, come out as a single open sheet; 0 keeps both sides

@@ -51,6 +51,8 @@ ROWS = [
             ("no-carving", "the hull as it is", {"carving_iterations": 0})),
     *_group("Photometric refinement",
             ("no-refinement", "off", {"refinement_iterations": 0}),
+            ("no-folds", "first round only", {"folds_iterations": 0}),
+            ("folds-always", "second round kept unseen", {"folds_gain": _ALWAYS}),
             ("no-sheets", "both sides of every sheet stay", {"sheet_thickness": 0.0}),
             ("unseen-stays", "what no view sees stays", {"unseen_area": 1.0}),
             ("refinement-always", "kept unseen", {"refinement_gain": _ALWAYS}),

@@ -13,8 +13,8 @@ from pipelines.surface_differences import SurfaceImage
 
 RESOLUTION = 24
 CASES = {case.name: case for case in scenes.SCENES}
-QUICK = ["sphere_translating", "sheet_scaling", "sharp_pleats", "cube_flat_shaded", "many_flat_faces", "leaving_the_frame",
-         "shadow_point_light", "shadow_directional"]
+QUICK = ["sphere_translating", "sheet_scaling", "sharp_pleats", "cube_flat_shaded", "many_flat_faces",
+         "leaving_the_frame", "shadow_point_light", "shadow_directional"]
 
 
 def path(case, **options):
