@@ -9,7 +9,10 @@ import numpy as np
 
 _WIDTH, _HEIGHT = 420, 180
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 10, 22, 24
-_COLORS = ("#c2571a", "#3a6ea5", "#4f8a5b", "#8a5aa5", "#777777")
+_COLORS = ("#c2571a", "#3a6ea5", "#4f8a5b", "#8a5aa5", "#777777", "#b8930f", "#2a9d9d")
+
+#: Rows of the legend: their height, and the characters that fit into one.
+_ROW, _CHARACTERS = 14, 70
 
 
 def curves(log: Path) -> list[str]:
@@ -46,7 +49,9 @@ def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic
     x_span, y_span = max(x_high - x_low, 1), max(y_high - y_low, 1e-6)
     across = lambda x: _LEFT + (x - x_low) / x_span * (_WIDTH - _LEFT - _RIGHT)  # noqa: E731
     down = lambda y: _TOP + (y_high - y) / y_span * (_HEIGHT - _TOP - _BOTTOM)  # noqa: E731
-    parts = [f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{title}">',
+    legend = _legend(list(points)) if len(points) > 1 else []
+    height = _HEIGHT + _ROW * len(legend)
+    parts = [f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{title}">',
              f'<text x="{_LEFT}" y="14" class="title">{title}</text>']
     for y in np.linspace(y_low, y_high, 4):
         label = f"{10 ** y:.2g}" if logarithmic else f"{y:.3g}"
@@ -58,8 +63,20 @@ def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic
         color = _COLORS[number % len(_COLORS)]
         path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across(x), down(y), strict=True))
         parts.append(f'<polyline points="{path}" stroke="{color}"><title>{name}</title></polyline>')
-        if len(points) > 1:
-            parts.append(f'<text x="{_WIDTH - _RIGHT - 46 * (len(points) - 1 - number)}" y="14" '
-                         f'text-anchor="end" fill="{color}">{name}</text>')
-    return "".join([*parts, "</svg>"])
+    return "".join([*parts, *legend, "</svg>"])
+
+
+def _legend(names: list[str]) -> list[str]:
+    """Rows of names in the colours of their lines."""
+    rows: list[list[str]] = [[]]
+    used = 0
+    for number, name in enumerate(names):
+        if used and used + len(name) > _CHARACTERS:
+            rows.append([])
+            used = 0
+        color = _COLORS[number % len(_COLORS)]
+        rows[-1].append(f'<tspan dx="10" fill="{color}">{name.replace("_", " ")}</tspan>')
+        used += len(name) + 2
+    return [f'<text x="{_WIDTH / 2}" y="{_HEIGHT - 8 + _ROW * (row + 1)}" text-anchor="middle">'
+            f'{"".join(tspans)}</text>' for row, tspans in enumerate(rows)]
 

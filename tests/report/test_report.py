@@ -66,6 +66,12 @@ def test_curves(tmp_path):
     points = np.array([p.split(",") for p in re.search(r'points="([^"]*)"', losses)[1].split()], float)
     assert np.ptp(np.diff(points, axis=0), axis=0) == pytest.approx(0, abs=0.2), "straight when logarithmic"
     assert points[0, 1] < points[-1, 1] and "PSNR" in psnr
+    many = {f"loss_number_{i}": 1.0 + i for i in range(12)}
+    log.write_text(json.dumps({"stage": "joint", "iteration": 0, **many}) + "\n")
+    rows = [re.findall(r">([^<]+)</tspan>", row) for row in re.findall(r"<text[^>]*>(<tspan.*?)</text>",
+                                                                       curves(log)[0])]
+    assert [name for row in rows for name in row] == [name.replace("_", " ") for name in many], "a legend of rows that fit"
+    assert all(sum(map(len, row)) <= 70 for row in rows)
     log.write_text(json.dumps({"stage": "joint", "iteration": 0, "loss": float("nan")}) + "\n")
     assert "polyline" not in "".join(curves(log))
 
