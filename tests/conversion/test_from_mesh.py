@@ -100,14 +100,16 @@ def _fold(gap):
 
 
 @pytest.mark.parametrize("gap", [0.6, 1.5])
-def test_layers_closer_than_a_cell_stay_apart(gap):
-    mesh = _fold(gap * LATTICE.spacing)
+@pytest.mark.parametrize("grid", GRIDS)
+def test_layers_closer_than_a_cell_stay_apart(grid, gap):
+    lattice = make_lattice(grid, LATTICE.resolution)
+    mesh = _fold(gap * lattice.spacing)
     assert (loop_count(mesh.faces), mesh.euler_number) == (1, 1)
     for turned in (False, True):  # the gap is outside, or inside
         if turned:
             mesh.invert()
-        fields = from_mesh(mesh, LATTICE)
-        _, faces, _ = extract(LATTICE, mi.Float(fields.sdf), mi.Float(fields.msdf)).to_numpy()
+        fields = from_mesh(mesh, lattice)
+        _, faces, _ = extract(lattice, mi.Float(fields.sdf), mi.Float(fields.msdf)).to_numpy()
         assert (loop_count(faces), component_count(faces), euler_characteristic(faces)) == (1, 1, 1)
 
 
