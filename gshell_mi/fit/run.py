@@ -276,21 +276,28 @@ class _Fit:
         state = self.checkpoint.arrays
         template = ghost_template(self.scene.subject, state, self.late_lattice)
         # Without a refinement, what was grown for being thin shrinks back.
-        moved, kept = template.start, False
         radiance = template.mesh.interpolate(mi.Float(state["radiance"].ravel()), 3).numpy().T
+        rounds, kept = [(template.start, radiance)], False
         if self.config.refinement_iterations:
-            moved, radiance, kept = self._refined(template, state)
+            rounds, kept = self._refined(template, state)
         fields = None
-        if (moved != template.vertices).any():
-            with self.books.timed("refinement"):
-                for cut in self._cuts(template, moved):
-                    fields = recast(self.scene.subject, template.vertices, cut.positions, template.faces,
-                                    cut.logits, radiance, self.config.ghost_min_area, cut.topology)
-                    if fields:
-                        break
+        with self.books.timed("refinement"):
+            for moved, radiance in rounds:
+                if fields is None and (moved != template.vertices).any():
+                    fields = self._recast(template, moved, radiance)
         self.checkpoint.facts["refinement_kept"] = kept and fields is not None
         found = fields or {name: state[name] for name in _SURFACE}
         self.books.enter("joint", **found | self._without_unseen(found), light=state["light"])
+
+    def _recast(self, template: GhostTemplate, moved: np.ndarray,
+                radiance: np.ndarray) -> dict[str, np.ndarray] | None:
+        """Fields of a moved template, cut as well as can be; None if no cut comes out whole."""
+        for cut in self._cuts(template, moved):
+            fields = recast(self.scene.subject, template.vertices, cut.positions, template.faces, cut.logits,
+                            radiance, self.config.ghost_min_area, cut.topology)
+            if fields:
+                return fields
+        return None
 
     def _without_unseen(self, surface: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The mSDF that cuts away what no view sees, if there is such."""
@@ -312,8 +319,9 @@ class _Fit:
         return [cut, as_found] if cut else [as_found]
 
     def _refined(self, template: GhostTemplate,
-                 state: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Vertices after the refinement, or their start if that is better; their radiance; which it was."""
+                 state: Mapping[str, np.ndarray]) -> tuple[list[tuple[np.ndarray, np.ndarray]], bool]:
+        """Vertices and radiance after the rounds of the refinement, the best first; or at their start if
+        that is better; which it was."""
         faces, solid, start = template.faces, template.solid, template.start
         known, unknown = self._split_pixels()
         ghost = RadianceGhost(start, faces, self.views, known, self.config, glossy=True)
@@ -338,9 +346,9 @@ class _Fit:
             before = ghost.unexplained(unknown)
             positions, error = moved("refinement", start, self.config)
             if error >= self.config.refinement_gain * before:
-                return start, ghost.radiance()[0], False
+                return [(start, ghost.radiance()[0])], False
             if not self.config.folds_iterations:
-                return positions, ghost.radiance()[0], True
+                return [(positions, ghost.radiance()[0])], True
             state = dict(state) | {"positions": positions}
             self.books.enter("folds", **state)
         else:
@@ -348,10 +356,11 @@ class _Fit:
             ghost.move(mi.Float(positions.ravel()))
             ghost.refit_anew(solid)
             error = ghost.unexplained(unknown)
-        radiance = ghost.radiance()[0]
+        first = positions, ghost.radiance()[0]
         farther, error_then = moved("folds", positions, self.config.for_folds())
         self.checkpoint.facts["folds_kept"] = kept = error_then < self.config.folds_gain * error
-        return (farther, ghost.radiance()[0], True) if kept else (positions, radiance, True)
+        second = farther, ghost.radiance()[0]
+        return [second, first] if kept else [first, second], True
 
     def _split_pixels(self) -> tuple[PixelPool, PixelPool]:
         """Pixels to learn the shape from, and those of views kept apart to judge it."""
