@@ -70,7 +70,8 @@ def test_curves(tmp_path):
     log.write_text(json.dumps({"stage": "joint", "iteration": 0, **many}) + "\n")
     rows = [re.findall(r">([^<]+)</tspan>", row) for row in re.findall(r"<text[^>]*>(<tspan.*?)</text>",
                                                                        curves(log)[0])]
-    assert [name for row in rows for name in row] == [name.replace("_", " ") for name in many], "a legend of rows that fit"
+    told = [name for row in rows for name in row]
+    assert told == [name.replace("_", " ") for name in many], "a legend of rows that fit"
     assert all(sum(map(len, row)) <= 70 for row in rows)
     log.write_text(json.dumps({"stage": "joint", "iteration": 0, "loss": float("nan")}) + "\n")
     assert "polyline" not in "".join(curves(log))
