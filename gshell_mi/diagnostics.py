@@ -10,6 +10,7 @@ import numpy as np
 
 from .compat import mesh_scene
 from .topology import topology, vertex_components
+from .triangles import area_vectors, unit
 from .views import PinholeViews
 from .visibility import best_view
 
@@ -91,11 +92,9 @@ def diagnose(surface: tuple[np.ndarray, np.ndarray], template: tuple[np.ndarray,
     counts = topology(vertices, faces)
     if len(faces) == 0:
         return Diagnostics(0, 0, 0, 0, 0.0, 0.0, None)
-    corners = vertices[faces].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = 0.5 * np.linalg.norm(normals, axis=1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    centers = corners.mean(axis=1)
+    doubled = area_vectors(vertices.astype(np.float64), faces)
+    area, normals = 0.5 * np.linalg.norm(doubled, axis=1), unit(doubled)
+    centers = vertices[faces].astype(np.float64).mean(axis=1)
     floaters = _floaters(len(vertices), faces, area)
     touching = _touching(centers, normals, template, cell)
     unseen = area * (best_view(centers, normals, surface, views) == 0)

@@ -76,3 +76,10 @@ def vertex_components(edges: np.ndarray, vertex_count: int) -> tuple[int, np.nda
     weights = np.ones(len(edges), np.int8)
     graph = coo_matrix((weights, (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
     return connected_components(graph, directed=False)
+
+
+def equal_patches(labels: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V,) ids of the connected patches of vertices with equal (V,) labels, on a mesh with (F, 3) faces."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    same = labels[edges[:, 0]] == labels[edges[:, 1]]
+    return vertex_components(edges[same], len(labels))[1]

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from ..compat import mesh_scene
 from ..images import srgb
+from ..triangles import area_vectors, unit
 from .ply import FittedMesh
 
 _OCCLUSION_RAYS = 64
@@ -61,7 +62,7 @@ def bake(fine: FittedMesh, vertices: np.ndarray, normals: np.ndarray, tangents: 
         size: pixels per side.
     """
     filled, at = _texels(faces, uv, size)
-    normal = _unit(at.interpolate(faces, normals))
+    normal = unit(at.interpolate(faces, normals))
     source = project(fine, at.interpolate(faces, vertices), normal)
     occlusion = source.interpolate(fine.faces, openness(fine))
     color = source.interpolate(fine.faces, fine.attributes["color"])
@@ -71,11 +72,11 @@ def bake(fine: FittedMesh, vertices: np.ndarray, normals: np.ndarray, tangents: 
     tangent = at.interpolate(faces, tangents[:, :3])
     bitangent = at.interpolate(faces, tangents[:, 3:] * np.cross(normals, tangents[:, :3]))
     frame = np.stack([tangent, bitangent, at.interpolate(faces, normals)], axis=-1)
-    fine_normal = _unit(source.interpolate(fine.faces, fine.normals))
+    fine_normal = unit(source.interpolate(fine.faces, fine.normals))
     # A frame may degenerate where tangents oppose each other.
     usable = np.abs(np.linalg.det(frame)) > 1e-3
     frame[~usable], fine_normal[~usable] = np.eye(3), [0, 0, 1]
-    local = _unit(np.linalg.solve(frame, fine_normal[..., None])[..., 0])
+    local = unit(np.linalg.solve(frame, fine_normal[..., None])[..., 0])
     local = np.where(local[:, 2:] > 0, local, [0.0, 0.0, 1.0])
     images = (srgb(color), np.stack([occlusion, roughness, metallic], axis=-1), 0.5 * local + 0.5)
     return Textures(*(_image(values, filled) for values in images))
@@ -85,7 +86,7 @@ def project(fine: FittedMesh, points: np.ndarray, normals: np.ndarray) -> Surfac
     """For each of (N, 3) points the nearest point of ``fine`` along its normal, on either side, that faces
     the same way; without one the nearest vertex."""
     scene = mesh_scene(fine.vertices, fine.faces)
-    geometric = _unit(_face_normals(fine.vertices, fine.faces))
+    geometric = unit(area_vectors(fine.vertices, fine.faces))
     best = np.full(len(points), np.inf)
     index, weights = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
     for sign in (1.0, -1.0):
@@ -138,13 +139,13 @@ def vertex_tangents(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray
     along_u = orientation * ((p1 - p0) * dv2[:, None] - (p2 - p0) * dv1[:, None])
     tangents, signs = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
     for corner in range(3):
-        np.add.at(tangents, faces[:, corner], _unit(along_u) * np.sqrt(np.abs(determinant))[:, None])
+        np.add.at(tangents, faces[:, corner], unit(along_u) * np.sqrt(np.abs(determinant))[:, None])
         np.add.at(signs, faces[:, corner], determinant)
-    tangents = _unit(tangents - (tangents * normals).sum(1, keepdims=True) * normals)
+    tangents = unit(tangents - (tangents * normals).sum(1, keepdims=True) * normals)
     lost = np.abs((tangents ** 2).sum(1) - 1) > 1e-3
     if lost.any():  # any direction in the tangent plane will do
         axis = np.eye(3)[np.abs(normals[lost]).argmin(1)]
-        tangents[lost] = _unit(np.cross(normals[lost], axis))
+        tangents[lost] = unit(np.cross(normals[lost], axis))
     return np.concatenate([tangents, np.where(signs < 0, -1.0, 1.0)[:, None]], axis=1)
 
 
@@ -171,12 +172,3 @@ def _image(values: np.ndarray, filled: np.ndarray) -> np.ndarray:
 
 def _point(values: np.ndarray) -> mi.Point3f:
     return mi.Point3f(np.ascontiguousarray(values.T, np.float32))
-
-
-def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.cross(b - a, c - a)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-20)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..topology import mesh_edges, topology
+from ..triangles import face_areas
 
 _PASSES = 10
 
@@ -31,14 +32,12 @@ def triangle_quality(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     squared = sum((edge ** 2).sum(1) for edge in (b - a, c - b, a - c))
-    doubled_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return 2 * np.sqrt(3) * doubled_area / np.maximum(squared, 1e-300)
+    return 4 * np.sqrt(3) * face_areas(vertices, faces) / np.maximum(squared, 1e-300)
 
 
 def edge_length_for(vertices: np.ndarray, faces: np.ndarray, face_count: int) -> float:
     """Edge length at which equilateral triangles of the mesh's area number ``face_count``."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+    area = face_areas(vertices, faces).sum()
     return float(np.sqrt(4 / np.sqrt(3) * area / face_count))
 
 

@@ -9,7 +9,7 @@ from topology import assert_manifold, boundary_edges, component_count, euler_cha
 
 from gshell_mi import UserError
 from gshell_mi.conversion import from_mesh
-from gshell_mi.conversion.from_mesh import _without_pinches
+from gshell_mi.conversion.loaded_mesh import without_pinches
 from gshell_mi.extraction import extract
 from gshell_mi.lattice import GRIDS, TetLattice, make_lattice
 
@@ -128,7 +128,7 @@ def test_a_rim_that_touches_itself_stays_one():
     mesh.merge_vertices()
     uses = np.bincount(np.ravel(boundary_edges(mesh.faces)))
     assert (uses == 4).sum() == 1, "two vertices of the rim have become one"
-    split = _without_pinches(mesh)
+    split = without_pinches(mesh)
     assert (len(split.vertices), len(split.faces)) == (len(mesh.vertices) + 1, len(mesh.faces))
     np.testing.assert_array_equal(split.triangles, mesh.triangles)
     assert np.bincount(np.ravel(boundary_edges(split.faces))).max() == 2
