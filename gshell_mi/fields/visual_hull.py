@@ -6,51 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
-from skimage.measure import find_contours
 
 from ..views import PinholeViews
-
-#: Samples per contour segment: the nearest sample is at most 1/8 pixel from the nearest point.
-_CONTOUR_SAMPLES = 4
-#: Pixels nearer to the outline than this get their distance from the sub-pixel contour.
-_NEAR = 6.0
-
-
-def mask_distance(alpha: np.ndarray, *, fill_holes: bool = True) -> np.ndarray:
-    """Signed distance to the outline of a coverage mask, negative inside.
-
-    The outline is the level set 1/2 of the coverage, located by linear interpolation between pixel
-    centres, so it is accurate to a small fraction of a pixel.
-
-    Args:
-        alpha: (height, width) coverage in [0, 1].
-        fill_holes: drops outlines that are enclosed by the object. Daylight seen through a garment
-            (in at the neck, out at a sleeve) would carve a tunnel through the hull whose walls then
-            have to be undone.
-
-    Returns:
-        (height, width) distances at the pixel centres, in pixels. An empty mask is +inf everywhere.
-    """
-    inside = alpha >= 0.5
-    if fill_holes:
-        filled = ndimage.binary_fill_holes(inside)
-        alpha = np.where(filled & ~inside, 1.0, alpha)
-        inside = filled
-    if not inside.any():
-        return np.full(alpha.shape, np.inf)
-    # The frame's border is no outline: what it cuts off may go on outside.
-    contours = find_contours(alpha, 0.5)
-    if not contours:
-        return np.full(alpha.shape, -np.inf)
-    steps = np.linspace(0.0, 1.0, _CONTOUR_SAMPLES, endpoint=False)[:, None, None]
-    samples = np.concatenate([((1 - steps) * contour[:-1] + steps * contour[1:]).reshape(-1, 2)
-                              for contour in contours])
-    # Far from the outline the distance between pixel centres is accurate enough and much cheaper.
-    distance = ndimage.distance_transform_edt(inside) + ndimage.distance_transform_edt(~inside) - 0.5
-    near = distance < _NEAR
-    distance[near] = cKDTree(samples).query(np.argwhere(near))[0]
-    return np.where(inside, -distance, distance)
+from .mask_outline import mask_distance, sharp
 
 
 def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray], *,
@@ -74,15 +32,18 @@ def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray
         whole object, so it also carves what it does not frame; points that no view says anything of are
         outside (+inf).
     """
+    thin_parts = sharp(alphas)
     votes = max(2, round(daylight_votes * len(views)))
     carved = dr.full(mi.Float, -dr.inf, dr.width(points))
     # The largest distances to the unfilled masks, sorted: the last one has `votes` supporters.
     daylight = [dr.full(mi.Float, -dr.inf, dr.width(points)) for _ in range(votes)]
     for index, alpha in enumerate(alphas):
         whole = not _touches_border(alpha)
-        filled = plain = _cone_distance(points, views, index, mask_distance(alpha), whole)
+        outline = mask_distance(alpha, thin_parts=thin_parts)
+        filled = plain = _cone_distance(points, views, index, outline, whole)
         if _has_holes(alpha):
-            plain = _cone_distance(points, views, index, mask_distance(alpha, fill_holes=False), whole)
+            outline = mask_distance(alpha, fill_holes=False, thin_parts=thin_parts)
+            plain = _cone_distance(points, views, index, outline, whole)
         carved = dr.maximum(carved, filled)
         for rank in range(votes):
             daylight[rank], plain = dr.maximum(daylight[rank], plain), dr.minimum(daylight[rank], plain)

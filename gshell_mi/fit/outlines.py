@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..fields.visual_hull import mask_distance
+from ..fields.mask_outline import mask_distance, sharp
 from ..topology import mesh_edges
 from ..views import PinholeViews
 from .mesh_normals import vertex_normals
@@ -40,7 +40,9 @@ class Outlines:
         self._edges = mi.Vector2u(edges.T.astype(np.uint32))
         self._edge_count = len(edges)
         diagonal = float(max(np.hypot(*size) for size in views.sizes))
-        distances = [np.clip(mask_distance(alpha, fill_holes=False), -diagonal, diagonal) for alpha in alphas]
+        thin_parts = sharp(alphas)
+        distances = [mask_distance(alpha, fill_holes=False, thin_parts=thin_parts).clip(-diagonal, diagonal)
+                     for alpha in alphas]
         counts = views.sizes.prod(axis=1)
         self._distances = mi.Float(np.concatenate([d.ravel() for d in distances]).astype(np.float32))
         self._first = mi.UInt32(np.concatenate([[0], np.cumsum(counts)[:-1]]))
