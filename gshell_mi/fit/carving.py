@@ -15,7 +15,8 @@ from ..lattice import Lattice
 from ..topology import topology
 from .ghost_template import GhostTemplate, ghost_template
 from .hollows import SEEN, hollows
-from .opening import clean_opacity, close_unjustified, msdf_from_template, splat_to_lattice, without_specks
+from .justified import close_unjustified
+from .opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
 from .pixels import PixelPool
 from .radiance_ghost import RadianceGhost
 from .radiance_volume import RadianceVolume
@@ -120,27 +121,31 @@ def _fitted(template: GhostTemplate, volume: RadianceVolume, pixels: PixelPool) 
 
 def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.ndarray, count: int,
                        volume: RadianceVolume, pixels: PixelPool, spacing: float) -> np.ndarray:
-    """(2, count + 1) sums of both ghosts' image errors over rays that see into each hollow.
+    """(2, count + 1) sums of both ghosts' errors over rays that see into each hollow, or through it.
 
-    A hollow that no ray sees into has no errors, hence no gain.
+    Rays that find nothing any more count by where they enter, and by their coverage: a hollow must leave the
+    masks as they are. One that no ray sees into has no errors, hence no gain.
     """
     labels, side = mi.UInt32(label.ravel().astype(np.uint32)), dr.opaque(mi.UInt32, len(label))
     sums = [dr.zeros(mi.Float, count + 1) for _ in range(2)]
     config = volume.config
+    coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0))
     with dr.suspend_grad():
         for step in range(_ERROR_STEPS):
             sample = pixels.sample(config.ghost_batch, seed=config.seed, step=step)
             ray = volume.views.rays(sample.view, sample.film)
             near, far = (ghost.scene.ray_intersect_preliminary(ray, coherent=False)
                          for ghost in (before, after))
-            point = volume.to_lattice @ ray(far.t)
             start = volume.to_lattice @ ray(near.t)
-            deeper = far.is_valid() & (dr.norm(point - start) > _DEEPER * spacing)
-            x, y, z = mi.Vector3u(dr.clip(dr.round((point + 1) / spacing), 0, mi.Float(side - 1)))
+            through = near.is_valid() & ~far.is_valid()
+            end = dr.select(through, start, volume.to_lattice @ ray(far.t))
+            deeper = through | far.is_valid() & (dr.norm(end - start) > _DEEPER * spacing)
+            x, y, z = mi.Vector3u(dr.clip(dr.round((end + 1) / spacing), 0, mi.Float(side - 1)))
             hollow = dr.gather(mi.UInt32, labels, x + side * (y + side * z), deeper)
             for ghost, total in zip((before, after), sums, strict=True):
-                radiance, _ = ghost.composite(ghost.sheets(ray), ray.d)
+                radiance, alpha = ghost.composite(ghost.sheets(ray), ray.d)
                 error = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
-                dr.scatter_reduce(dr.ReduceOp.Add, total, error.x + error.y + error.z, hollow, deeper)
+                error = error.x + error.y + error.z + coverage * dr.abs(alpha - sample.alpha)
+                dr.scatter_reduce(dr.ReduceOp.Add, total, error, hollow, deeper)
             dr.eval(sums)
     return np.stack([total.numpy() for total in sums])

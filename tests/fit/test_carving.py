@@ -88,3 +88,14 @@ def test_the_shape_may_have_had_another_lattice():
     found = ghost_template(subject, state, lattice)
     assert subject.lattice == lattice
     np.testing.assert_allclose(found.logits, 2, rtol=1e-5)
+
+
+def test_a_hollow_may_not_eat_into_a_silhouette(trained, monkeypatch):
+    """The block carved to the ball inside it: what is gone between them would be sky."""
+    axis = np.linspace(-1, 1, RESOLUTION + 1)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    outside_of_ball = (np.sqrt(x**2 + y**2 + z**2) - HALF) / CELL
+    monkeypatch.setattr(carving, "hollows", lambda *_: outside_of_ball)
+    # The patterns alone, where there still is something, are off by a factor of six.
+    monkeypatch.setattr(carving, "_GAIN", 10.0)
+    assert trained(solid_block)[2] is None
