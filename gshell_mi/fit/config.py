@@ -87,7 +87,7 @@ class FitConfig:
     """Final weight of the loss that closes what the images leave undecided."""
     ghost_chroma: float = 0.003
     """Weight of the tie between the chroma of a sheet's two sides."""
-    ghost_gain: float = 0.8
+    ghost_gain: float = 0.9
     """An opening stays if the image error through it is below this fraction of what it is when closed."""
     ghost_min_area: float = 0.005
     """Holes and islands smaller than this fraction of the template's area are noise and are undone."""

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..extraction.surface_mesh import SurfaceMesh
-from ..fields.smoothing import LatticeDiffusion
+from ..fields.smoothing import LatticeDiffusion, MeshDiffusion
 from ..lattice import Lattice
-from ..topology import vertex_components
+from ..topology import equal_patches
+from ..triangles import face_areas
 
 #: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
 _CERTAIN = 3.0
 
 #: What a speck leaves at its neighbours when it goes may be the next one.
 _CLEANINGS = 4
+
+#: Share of newly open vertices around a vertex from which on its value is new.
+_NEAR = 0.01
 
 
 def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, min_area: float) -> np.ndarray:
@@ -32,52 +34,35 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
         (V,) logits, those of flipped patches negated.
     """
     area = np.zeros(len(vertices))
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    face_area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     for corner in range(3):
-        np.add.at(area, faces[:, corner], face_area / 3)
+        np.add.at(area, faces[:, corner], face_areas(vertices, faces) / 3)
     cleaned = logits.copy()
     # Cuts first: an island in a cut that closes is none.
     for flip_closed in (False, True):
         solid = cleaned > 0
-        patch = _patches(solid, faces)
+        patch = equal_patches(solid, faces)
         small = np.bincount(patch, area)[patch] < min_area * area.sum()
         flip = small & (solid == flip_closed)
         cleaned[flip] = -cleaned[flip]
     return cleaned
 
 
-def close_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.ndarray], np.ndarray],
-                      gain: float) -> np.ndarray:
-    """Closes the openings through which the images are not explained better than without them.
-
-    A hull that bulges over a fold, or a highlight, makes the views disagree on a vertex's radiance as a
-    cap does, and may open there. But the sheet behind such a hole is farther from the truth than the hull,
-    so the images disagree more.
+def also_opened(values: np.ndarray, added: np.ndarray, smooth: MeshDiffusion,
+                scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Opens further vertices of a template, with smooth rims.
 
     Args:
-        logits: (V,) opacity logits; surface where positive.
-        faces: (F, 3) of the template.
-        error: maps (V,) opaque or not to the (V,) image error through each vertex.
-        gain: an opening stays if the error through it is less than this fraction of the closed one's.
+        values: (V,) negative where the template is open.
+        added: (V,) the vertices to open.
+        smooth: along the template.
+        scale: of the new values; in [-scale, scale].
 
     Returns:
-        (V,) logits, those of unjustified openings negated.
+        (V,) values, and which of them are new.
     """
-    opened = logits <= 0
-    if not opened.any():
-        return logits
-    closed_error, open_error = error(np.ones_like(opened)), error(~opened)
-    patch = _patches(opened, faces)
-    before, after = (np.bincount(patch, e)[patch] for e in (closed_error, open_error))
-    return np.where(opened & (after > gain * before), -logits, logits)
-
-
-def _patches(label: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V,) ids of the connected patches of equal label."""
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    same = label[edges[:, 0]] == label[edges[:, 1]]
-    return vertex_components(edges[same], len(label))[1]
+    signs = smooth(mi.Float(np.where(added | (values <= 0), -1, 1).astype(np.float32))).numpy()
+    near = smooth(mi.Float(added.astype(np.float32))).numpy() > _NEAR
+    return np.where(near, scale * signs, values), near
 
 
 def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: Lattice) -> mi.Float:

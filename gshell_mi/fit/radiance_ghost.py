@@ -45,6 +45,9 @@ _REFIT_STEPS, _ERROR_STEPS = 40, 20
 #: Refits of a ghost that has not learnt anything yet.
 _ROUNDS_FROM_GREY = 3
 
+#: Coverage of a pixel from which on nothing of the background is in it.
+_COVERED = 0.99
+
 #: Random pixels of these steps must not depend on how many training steps came before.
 _EXTRA_STEP = 1 << 20
 
@@ -133,22 +136,23 @@ class RadianceGhost:
         """How badly the images are explained through each vertex if just the vertices ``opaque`` are.
 
         Returns:
-            (V,) sum of the image error over random rays by the vertices of the *first* sheet that they
-            meet, whether that sheet is opaque or not. Sums for different opacities run over the same
-            rays, hence they compare patch by patch.
+            (2, V) sums of the image error over random rays by the vertices of the *first* sheet that they
+            meet, whether that sheet is opaque or not: over all pixels, and over those that are wholly
+            covered. Sums for different opacities run over the same rays, hence they compare patch by patch.
         """
         self.refit(opaque)
-        total = dr.zeros(mi.Float, self.vertex_count)
+        sums = [dr.zeros(mi.Float, self.vertex_count) for _ in range(2)]
         with dr.suspend_grad():
             for step in range(_ERROR_STEPS):
                 sample, radiance, _, sheets = self._render(_EXTRA_STEP + _REFIT_STEPS + step)
                 difference = dr.abs(self._tone(radiance) - self._tone(sample.radiance))
                 hit, face, weights, _ = sheets[0]
-                for corner in range(3):
-                    share = weights[corner] * (difference.x + difference.y + difference.z)
-                    dr.scatter_reduce(dr.ReduceOp.Add, total, share, face[corner], hit)
-                dr.eval(total)
-        return total.numpy()
+                for total, counts in zip(sums, (hit, hit & (sample.alpha > _COVERED)), strict=True):
+                    for corner in range(3):
+                        share = weights[corner] * (difference.x + difference.y + difference.z)
+                        dr.scatter_reduce(dr.ReduceOp.Add, total, share, face[corner], counts)
+                dr.eval(sums)
+        return np.stack([total.numpy() for total in sums])
 
     def unexplained(self, pixels: PixelPool) -> float:
         """Mean image loss on other pixels than those that the ghost was trained on."""

@@ -17,6 +17,7 @@ from ..conversion.solid_distance import solid_distance
 from ..fields import LatticeFields
 from ..fields.smoothing import MeshDiffusion
 from ..topology import Topology, topology
+from ..triangles import area_vectors
 from .opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
 from .template_sides import cast, normals_at_vertices, opposite_sides
 
@@ -154,8 +155,7 @@ def _values_on(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray, poin
     same = np.einsum("nkj,nj->nk", facing[near], normals) > 0
     result = values[near[np.arange(len(points)), same.argmax(axis=1)]]
     best = np.full(len(points), np.inf)
-    face_normals = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]],
-                            vertices[faces[:, 2]] - vertices[faces[:, 0]])
+    face_normals = area_vectors(vertices, faces)
     # A ray that starts on the mesh would miss it.
     behind = 0.05 * reach
     for direction in (normals, -normals):

@@ -15,6 +15,7 @@ import numpy as np
 
 from .. import losses
 from ..fields.smoothing import MeshDiffusion, falling
+from ..triangles import face_areas
 from .config import FitConfig
 from .observer import Preview
 from .outlines import Outlines
@@ -43,8 +44,7 @@ class PhotometricRefinement:
                  outlines: Outlines | None, length: float, config: FitConfig):
         self.ghost, self.faces, self.outlines, self.config = ghost, faces, outlines, config
         self.length = length
-        a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+        area = face_areas(vertices, faces).sum()
         #: Vertices per square cell: what turns a lambda of cells into one of edges.
         self._density = len(vertices) * length**2 / area
         # One step size for all vertices: what little noise moves must not move as far as the rest.

@@ -1,5 +1,5 @@
-"""The fit from start to end, with checkpoints: hull, ghost, carving, refinement, joint and detail stage,
-export."""
+"""The fit from start to end, with checkpoints: hull, ghost, carving, refinement, folds, joint and detail
+stage, export."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ from .findings import findings
 from .ghost_template import GhostTemplate, closed_template, ghost_template
 from .interrupt import Interrupt
 from .joint import JointStage
+from .justified import close_unjustified, open_unjustified
 from .memory import MemoryEstimate
 from .observer import Observer
-from .opening import clean_opacity, close_unjustified, msdf_from_template, splat_to_lattice
-from .outlines import Outlines
+from .opening import clean_opacity, msdf_from_template, splat_to_lattice
 from .pixels import PixelPool
 from .progress import Progress
 from .radiance_ghost import RadianceGhost
 from .radiance_volume import RadianceVolume
 from .recast import recast
-from .refinement import PhotometricRefinement
+from .rounds import Moved, RefinementRounds
 from .spare_sides import Cut, without_spare_sides
 from .start import (
     EARLY_GRIDS,
@@ -250,8 +250,10 @@ class _Fit:
     def _openings(self, ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """(V,) opacity logits of a fitted ghost, negative where the images justify an opening."""
         clean = partial(clean_opacity, vertices=vertices, faces=faces, min_area=self.config.ghost_min_area)
-        return clean(close_unjustified(clean(ghost.smoothed_logits()), faces, ghost.image_error,
-                                       self.config.ghost_gain))
+        logits = clean(ghost.smoothed_logits())
+        for judge in (close_unjustified, open_unjustified):
+            logits = clean(judge(logits, faces, ghost.image_error, self.config.ghost_gain))
+        return logits
 
     def _carve(self) -> None:
         """Hollows out what the hull bridges."""
@@ -275,26 +277,32 @@ class _Fit:
         """Moves the template inside the hull, and the fields with it."""
         state = self.checkpoint.arrays
         template = ghost_template(self.scene.subject, state, self.late_lattice)
+        rounds = []
+        if self.config.refinement_iterations:
+            rounds = RefinementRounds(template, self.scene, self.views, *self._split_pixels(), self.config,
+                                      self.books).run(state)
         # Without a refinement, what was grown for being thin shrinks back.
         radiance = template.mesh.interpolate(mi.Float(state["radiance"].ravel()), 3).numpy().T
-        rounds, kept = [(template.start, radiance)], False
-        if self.config.refinement_iterations:
-            rounds, kept = self._refined(template, state)
-        fields = None
+        found, taken = {name: state[name] for name in _SURFACE}, "start"
         with self.books.timed("refinement"):
-            for moved, radiance in rounds:
-                if fields is None and (moved != template.vertices).any():
-                    fields = self._recast(template, moved, radiance)
-        self.checkpoint.facts["refinement_kept"] = kept and fields is not None
-        found = fields or {name: state[name] for name in _SURFACE}
+            for moved in (*rounds, Moved("start", template.start, radiance, np.inf)):
+                if fields := self._recast(template, moved):
+                    found, taken = fields, moved.stage
+                    break
+        facts = self.checkpoint.facts
+        facts["refinement_kept"] = taken != "start"
+        if any(moved.stage == "folds" for moved in rounds):
+            facts["folds_kept"] = taken == "folds"
         self.books.enter("joint", **found | self._without_unseen(found), light=state["light"])
 
-    def _recast(self, template: GhostTemplate, moved: np.ndarray,
-                radiance: np.ndarray) -> dict[str, np.ndarray] | None:
-        """Fields of a moved template, cut as well as can be; None if no cut comes out whole."""
-        for cut in self._cuts(template, moved):
+    def _recast(self, template: GhostTemplate, moved: Moved) -> dict[str, np.ndarray] | None:
+        """Fields of a moved template, cut as well as can be; None if no cut comes out whole, or it has not
+        moved."""
+        if (moved.positions == template.vertices).all():
+            return None
+        for cut in self._cuts(template, moved.positions):
             fields = recast(self.scene.subject, template.vertices, cut.positions, template.faces, cut.logits,
-                            radiance, self.config.ghost_min_area, cut.topology)
+                            moved.radiance, self.config.ghost_min_area, cut.topology)
             if fields:
                 return fields
         return None
@@ -317,50 +325,6 @@ class _Fit:
         cut = without_spare_sides(as_found, template.vertices, template.faces, self.scene.subject.cell_size,
                                   self.config.sheet_thickness)
         return [cut, as_found] if cut else [as_found]
-
-    def _refined(self, template: GhostTemplate,
-                 state: Mapping[str, np.ndarray]) -> tuple[list[tuple[np.ndarray, np.ndarray]], bool]:
-        """Vertices and radiance after the rounds of the refinement, the best first; or at their start if
-        that is better; which it was."""
-        faces, solid, start = template.faces, template.solid, template.start
-        known, unknown = self._split_pixels()
-        ghost = RadianceGhost(start, faces, self.views, known, self.config, glossy=True)
-        outlines = None
-        if self.pixels.has_alpha:
-            alphas = [target.rgba[..., 3] for target in self.scene.targets]
-            outlines = Outlines(self.views, alphas, faces, solid)
-
-        def moved(stage: str, positions: np.ndarray, config: FitConfig) -> tuple[np.ndarray, float]:
-            """Positions after a round of the refinement, and the error of the unseen views with them."""
-            refinement = PhotometricRefinement(ghost, positions, faces, outlines,
-                                               self.scene.subject.cell_size, config)
-            self.books.iterate(stage, config.refinement_iterations, refinement,
-                               {"ghost": ghost.optimizer, "refinement": refinement.optimizer}, state)
-            with self.books.timed(stage):
-                ghost.move(mi.Float(refinement.positions().ravel()))
-                ghost.refit(solid)
-                return refinement.positions(), ghost.unexplained(unknown)
-
-        if self.checkpoint.stage == "refinement":
-            ghost.refit_anew(solid)
-            before = ghost.unexplained(unknown)
-            positions, error = moved("refinement", start, self.config)
-            if error >= self.config.refinement_gain * before:
-                return [(start, ghost.radiance()[0])], False
-            if not self.config.folds_iterations:
-                return [(positions, ghost.radiance()[0])], True
-            state = dict(state) | {"positions": positions}
-            self.books.enter("folds", **state)
-        else:
-            positions = state["positions"]
-            ghost.move(mi.Float(positions.ravel()))
-            ghost.refit_anew(solid)
-            error = ghost.unexplained(unknown)
-        first = positions, ghost.radiance()[0]
-        farther, error_then = moved("folds", positions, self.config.for_folds())
-        self.checkpoint.facts["folds_kept"] = kept = error_then < self.config.folds_gain * error
-        second = farther, ghost.radiance()[0]
-        return [second, first] if kept else [first, second], True
 
     def _split_pixels(self) -> tuple[PixelPool, PixelPool]:
         """Pixels to learn the shape from, and those of views kept apart to judge it."""

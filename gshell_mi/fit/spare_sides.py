@@ -16,6 +16,7 @@ import numpy as np
 
 from ..fields.smoothing import MeshDiffusion
 from ..topology import Topology, mesh_edges, vertex_components
+from .opening import also_opened
 from .template_sides import normals_at_vertices, opposite_sides
 
 #: Parts are thin up to this thickness, in cells.
@@ -38,9 +39,6 @@ _RIDGE = 3
 
 #: Rounds of smoothing and balancing.
 _BALANCINGS = 10
-
-#: Share of spare vertices around a vertex from which on its logit is new.
-_NEAR = 0.01
 
 
 @dataclass(frozen=True)
@@ -75,11 +73,10 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
     spare, sheets = spare_sides(thickness, opposite, normals, faces, solid, smooth, cell, sheet_thickness)
     if not spare.any():
         return None
-    signs = smooth(mi.Float(np.where(spare | ~solid, -1, 1).astype(np.float32))).numpy()
-    near = smooth(mi.Float(spare.astype(np.float32))).numpy() > _NEAR
+    logits, _ = also_opened(cut.logits, spare, smooth)
     thickness, opposite = opposite_sides(before, before, faces, cell)
     opposite = np.where(np.isfinite(thickness), opposite, -1)
-    return Cut(np.where(near, signs, cut.logits), carried(before, cut.positions, spare, opposite, smooth),
+    return Cut(logits, carried(before, cut.positions, spare, opposite, smooth),
                dataclasses.replace(cut.topology, boundary_loops=cut.topology.boundary_loops + sheets))
 
 

@@ -11,7 +11,6 @@ from gshell_mi.extraction import extract
 from gshell_mi.fields import sphere
 from gshell_mi.fit.opening import (
     clean_opacity,
-    close_unjustified,
     msdf_from_template,
     splat_to_lattice,
     without_specks,
@@ -48,41 +47,6 @@ def test_large_patches_stay(ball):
 def test_an_island_in_a_small_cut_is_just_surface(ball):
     logits = np.where(cap(ball, [0, 0, 1], 0.015) & ~cap(ball, [0, 0, 1], 0.004), -1.0, 1.0)
     assert (clean_opacity(logits, ball.vertices, ball.faces, min_area=0.02) > 0).all()
-
-
-def test_an_opening_stays_if_it_explains_the_images(ball):
-    """Two openings: through the upper one the error falls to a half, through the lower one to 0.9."""
-    up, down = cap(ball, [0, 0, 1], 0.1), cap(ball, [0, 0, -1], 0.1)
-    logits = np.where(up | down, -1.0, 2.0)
-    asked = []
-
-    def error(opaque):
-        asked.append(opaque)
-        return np.where(opaque, 1.0, np.where(up, 0.5, 0.9))
-
-    result = close_unjustified(logits, ball.faces, error, gain=0.8)
-    np.testing.assert_array_equal(result <= 0, up)
-    np.testing.assert_array_equal(np.abs(result), np.abs(logits))
-    assert asked[0].all(), "compared with the closed template"
-    np.testing.assert_array_equal(asked[1], logits > 0)
-    np.testing.assert_array_equal(close_unjustified(logits, ball.faces, error, gain=0.95), logits)
-
-
-def test_the_error_counts_per_opening_not_per_vertex(ball):
-    """Half of an opening's vertices may get worse if the other half gains more."""
-    up = cap(ball, [0, 0, 1], 0.1)
-    half = up & (ball.vertices[:, 0] > 0)
-    logits = np.where(up, -1.0, 1.0)
-
-    def error(opaque):
-        return np.where(opaque, 1.0, np.where(half, 1.1, 0.1))
-
-    np.testing.assert_array_equal(close_unjustified(logits, ball.faces, error, gain=0.8), logits)
-
-
-def test_nothing_open_nothing_asked(ball):
-    logits = np.ones(len(ball.vertices))
-    assert close_unjustified(logits, ball.faces, None, gain=0.8) is logits
 
 
 @pytest.mark.parametrize("height", [-0.21, 0.0, 0.337])
