@@ -15,6 +15,10 @@ ROUGHNESS_RANGE = (0.08, 1.0)
 #: Vertex attributes of the mesh, and the principled BSDF's parameters that read them.
 ATTRIBUTES = {"vertex_color": "base_color", "vertex_roughness": "roughness", "vertex_metallic": "metallic"}
 
+#: Parameters that the whole object shares, by the attribute whose logits they are added to. What little each
+#: vertex is told about its gloss drowns in noise; what all are told together does not.
+_SHARED = {"vertex_roughness": "shared_roughness", "vertex_metallic": "shared_metallic"}
+
 
 class MaterialField:
     """Base colour, roughness and metallic at the lattice's vertices, interpolated to the mesh's.
@@ -27,8 +31,8 @@ class MaterialField:
         base_color: one colour instead.
         roughness, metallic: in [0, 1], uniform to start with.
 
-    The optimised parameters are the logits in ``parameters``, a dictionary of flat ``mi.Float`` by the
-    names of the mesh's attributes; colours are interleaved.
+    The optimised ``parameters`` are logits: flat ``mi.Float`` by the names of the mesh's attributes, colours
+    interleaved, and one number each that is added to all roughnesses and all metallics.
     """
 
     def __init__(self, reflectance: np.ndarray, *, base_color: np.ndarray | None = None,
@@ -41,15 +45,24 @@ class MaterialField:
             "vertex_color": mi.Float(_logit(reflectance).astype(np.float32).ravel()),
             "vertex_roughness": dr.full(mi.Float, float(_logit((roughness - low) / (high - low))), count),
             "vertex_metallic": dr.full(mi.Float, float(_logit(metallic)), count),
-        }
+        } | {name: mi.Float([0.0]) for name in _SHARED.values()}
+
+    @property
+    def on_lattice(self) -> list[str]:
+        """The names of the parameters that have a value per vertex."""
+        return [name for name in self.parameters if name in ATTRIBUTES]
 
     def carry(self, carried: Carried) -> None:
         """Moves the parameters to other blocks of the lattice."""
-        self.parameters = {name: carried.values(dr.detach(field)) for name, field in self.parameters.items()}
+        for name in self.on_lattice:
+            self.parameters[name] = carried.values(dr.detach(self.parameters[name]))
 
     def values(self) -> dict[str, mi.Float]:
         """The lattice fields themselves, all in [0, 1], by attribute name."""
-        unit = {name: sigmoid(logits) for name, logits in self.parameters.items()}
+        logits = {name: self.parameters[name] for name in self.on_lattice}
+        for name, shared in _SHARED.items():
+            logits[name] = logits[name] + self.parameters[shared]
+        unit = {name: sigmoid(field) for name, field in logits.items()}
         low, high = ROUGHNESS_RANGE
         unit["vertex_roughness"] = low + (high - low) * unit["vertex_roughness"]
         return unit
@@ -68,6 +81,7 @@ class GivenMaterial:
                  metallic: float = 0.0):
         color = np.broadcast_to(0.5 if base_color is None else base_color, (count, 3))
         self.parameters: dict[str, mi.Float] = {}
+        self.on_lattice: list[str] = []
         self._values = {"vertex_color": mi.Float(color.astype(np.float32).ravel()),
                         "vertex_roughness": dr.full(mi.Float, roughness, count),
                         "vertex_metallic": dr.full(mi.Float, metallic, count)}

@@ -48,6 +48,27 @@ def test_derivative(color):
     np.testing.assert_allclose(dr.grad(material.parameters["vertex_color"]).numpy(), expected, atol=1e-5)
 
 
+def test_gloss_has_a_part_that_all_vertices_share(color):
+    material = MaterialField(color, roughness=0.5, metallic=0.5)
+    before = material.values()
+    material.parameters["shared_metallic"] = mi.Float([1.0])
+    after = material.values()
+    np.testing.assert_allclose(after["vertex_metallic"].numpy(), 1 / (1 + np.exp(-1)), atol=1e-6)
+    for name in ("vertex_color", "vertex_roughness"):
+        np.testing.assert_array_equal(after[name].numpy(), before[name].numpy())
+    assert set(material.on_lattice) == set(ATTRIBUTES), "they have a value per vertex, what is shared has not"
+
+
+def test_what_is_shared_hears_every_vertex(color):
+    material = MaterialField(color, metallic=0.5)
+    dr.enable_grad(material.parameters)
+    weight = np.arange(50, dtype=np.float32)
+    dr.backward(dr.sum(mi.Float(weight) * material.values()["vertex_metallic"]))
+    own, shared = (dr.grad(material.parameters[f"{name}_metallic"]).numpy() for name in ("vertex", "shared"))
+    np.testing.assert_allclose(own, weight / 4, rtol=1e-5)
+    np.testing.assert_allclose(shared, [own.sum()], rtol=1e-5)
+
+
 def test_one_colour_for_all():
     values = MaterialField(np.zeros((4, 3)), base_color=np.array([0.2, 0.4, 0.6])).values()
     np.testing.assert_allclose(values["vertex_color"].numpy(), 4 * [0.2, 0.4, 0.6], atol=1e-6)

@@ -171,7 +171,7 @@ class JointStage:
         if carried is None:
             return
         self.geometry.carry(carried)
-        carried.optimizer(self.shading, self.material.parameters)
+        carried.optimizer(self.shading, self.material.on_lattice)
         self.material.carry(carried)
         self._diffuse = LatticeDiffusion(carried.after)
 
@@ -179,7 +179,7 @@ class JointStage:
         config, optimizer = self.config, self.shading
         if not optimizer.state:
             return
-        for name in self.material.parameters:
+        for name in self.material.on_lattice:
             gradient = dr.grad(optimizer[name])
             dr.set_grad(optimizer[name], self._diffuse(gradient, config.material_gradient_smoothing))
         rates = dict.fromkeys(self.material.parameters, decay * config.material_lr)

@@ -11,6 +11,10 @@ from ..topology import equal_patches, mesh_edges, vertex_components
 #: Openings are parted where they are at most twice this many vertices wide.
 _NECK = 2
 
+#: Openings below this fraction of the template's vertices have to be justified the better, by this factor,
+#: and by every choice of pixels: a bulge beside a handle is small, and few rays tell of a small opening.
+_SMALL, _STRICTER = 0.05, 0.75
+
 #: Rounds in which openings are closed, each time those that are this near to the worst; in the last one all.
 _CLOSINGS, _WORST = 5, 0.5
 
@@ -22,7 +26,8 @@ def close_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np
     A hull that bulges over a fold, or a highlight, makes the views disagree on a vertex's radiance as a
     cap does, and may open there. But the sheet behind such a hole is farther from the truth than the hull,
     so the images disagree more. Where a hull bulges into daylight, beside a handle, the daylight alone would
-    justify an opening; pixels that are wholly covered do not.
+    justify a small opening; pixels that are wholly covered do not. The inside of a skirt may be so dark that
+    daylight, seen through its waist, is all that speaks for its hem.
 
     What hangs together by a narrow neck only is judged in parts. Through one opening others are seen, so the
     least justified are closed first.
@@ -31,9 +36,9 @@ def close_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np
         logits: (V,) opacity logits; surface where positive.
         faces: (F, 3) of the template.
         error: maps (V,) opaque or not to the image error through each vertex, (k, V) for several choices of
-            pixels.
-        gain: an opening stays if the error through it is less than this fraction of the closed one's, for
-            every choice of pixels.
+            pixels, the first of which are all.
+        gain: an opening stays if the error through it is less than this fraction of the closed one's; small
+            ones need a better reason.
 
     Returns:
         (V,) logits, those of unjustified openings negated.
@@ -44,12 +49,14 @@ def close_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np
     closed_error = error(np.ones_like(opened))
     for closing in range(_CLOSINGS):
         patch = _lobes(opened, faces)
-        ratio = _worst_ratio(closed_error, error(~opened), patch)
-        ratio[np.bincount(patch, opened) == 0] = 0
-        if not (ratio > gain).any():
+        ratios = _ratios(closed_error, error(~opened), patch) / gain
+        small = np.bincount(patch) < _SMALL * len(opened)
+        excess = np.where(small, ratios.max(axis=0) / _STRICTER, ratios[0])
+        excess[np.bincount(patch, opened) == 0] = 0
+        if not (excess > 1).any():
             break
         # At last there is no time for more.
-        worst = ratio > (gain if closing == _CLOSINGS - 1 else max(gain, _WORST * ratio.max()))
+        worst = excess > (1 if closing == _CLOSINGS - 1 else max(1, _WORST * excess.max()))
         opened &= ~worst[patch]
     return np.where((logits <= 0) & ~opened, -logits, logits)
 
@@ -75,7 +82,7 @@ def open_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.
     island = solid & (size[patch] < largest[part])
     if not island.any():
         return logits
-    ratio = _worst_ratio(error(solid), error(solid & ~island), patch)
+    ratio = _ratios(error(solid), error(solid & ~island), patch).max(axis=0)
     return np.where(island & (gain * ratio[patch] < 1), -logits, logits)
 
 
@@ -98,7 +105,7 @@ def _lobes(opened: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(opened, lobe, 1 + len(opened) + patch)
 
 
-def _worst_ratio(before: np.ndarray, after: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """By what factor the (k, V) errors change in each patch, for the choice of pixels that loses most."""
-    sums = [[np.bincount(patch, values) for values in errors] for errors in (before, after)]
-    return (np.array(sums[1]) / np.maximum(sums[0], 1e-30)).max(axis=0)
+def _ratios(before: np.ndarray, after: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """(k, P) factors by which (k, V) errors change in each patch."""
+    sums = [np.array([np.bincount(patch, values) for values in errors]) for errors in (before, after)]
+    return sums[1] / np.maximum(sums[0], 1e-30)

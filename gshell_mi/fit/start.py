@@ -102,8 +102,9 @@ def _resampled_material(arrays: Mapping[str, np.ndarray], lattice: Lattice | Blo
     before = lattice_of(lattice.grid, arrays["sdf"].size)
     points = lattice.points(mi.Float)
     material = MaterialField(np.full((lattice.vertex_count, 3), TYPICAL_REFLECTANCE))
-    material.parameters = {name: Interpolation(mi.Float(arrays[name]), before)(points)
-                           for name in material.parameters}
+    material.parameters = {name: mi.Float(arrays[name]) for name in material.parameters}
+    for name in material.on_lattice:
+        material.parameters[name] = Interpolation(material.parameters[name], before)(points)
     return material
 
 

@@ -53,12 +53,13 @@ def test_a_step_is_that_on_the_whole_lattice(fit):
                                for key in optimizer.keys()}
     assert after["dense"][0] == pytest.approx(after["stored"][0], rel=1e-4)
     blocks = stored.lattice
+    everywhere = {"light", "shared_roughness", "shared_metallic"}
     for key, (value, _, _, (_, first, second, _)) in after["stored"][1].items():
         expected = after["dense"][1][key]
         for now, then in ((value, expected[0]), (first, expected[3][1]), (second, expected[3][2])):
-            then = then if key == "light" else blocks.take(then)
+            then = then if key in everywhere else blocks.take(then)
             inside = blocks.in_lattice(dr.arange(mi.UInt32, blocks.vertex_count)).numpy()
-            inside = inside.repeat(dr.width(now) // len(inside)) if key != "light" else slice(None)
+            inside = inside.repeat(dr.width(now) // len(inside)) if key not in everywhere else slice(None)
             scale = np.abs(then.numpy()).max()
             if key in ("sdf", "msdf", "deform") or now is not value:
                 np.testing.assert_allclose(now.numpy()[inside], then.numpy()[inside], atol=1e-3 * scale)
@@ -76,7 +77,7 @@ def test_blocks_follow_the_surface_with_all_that_is_stored_in_them(fit):
         lattice = joint.subject.lattice
         assert lattice.covers(joint.subject.surface.cells)
         for optimizer, names in ((joint.geometry.optimizer, ("sdf", "msdf", "deform")),
-                                 (joint.shading, joint.material.parameters)):
+                                 (joint.shading, joint.material.on_lattice)):
             for name in names:
                 value, _, _, (step, moment, _, _) = optimizer.state[name]
                 assert dr.width(value) == dr.width(moment) and dr.width(value) % lattice.vertex_count == 0

@@ -84,13 +84,19 @@ def test_what_a_neck_joins_is_judged_apart(ball):
     assert (result[up] < 0).all() and (result[side] > 0).all()
 
 
-@pytest.mark.parametrize("second", [0.5, 0.9])
-def test_every_choice_of_pixels_has_to_justify_it(ball, second):
-    up = cap(ball, [0, 0, 1], 0.1)
+@pytest.mark.parametrize(("share", "every", "covered", "stays"), [
+    (0.03, 0.5, 0.5, True),
+    (0.03, 0.5, 0.9, False),    # beside a handle
+    (0.03, 0.7, 0.5, False),    # 0.8 is not enough for so small a one
+    (0.10, 0.7, 1.0, True),     # a dark hem
+    (0.10, 0.9, 0.5, False),
+])
+def test_a_small_opening_needs_better_reasons(ball, share, every, covered, stays):
+    up = cap(ball, [0, 0, 1], share)
     result = close_unjustified(
         np.where(up, -1.0, 1.0), ball.faces,
-        lambda opaque: np.stack([np.where(opaque, 1.0, ratio) for ratio in (0.5, second)]), gain=0.8)
-    np.testing.assert_array_equal(result <= 0, up if second < 0.8 else np.zeros_like(up))
+        lambda opaque: np.stack([np.where(opaque, 1.0, ratio) for ratio in (every, covered)]), gain=0.8)
+    np.testing.assert_array_equal(result <= 0, up & stays)
 
 
 @pytest.mark.parametrize(("without", "stays"), [(1.05, False), (1.5, True)])
