@@ -14,6 +14,8 @@ left would depend on the pixel of i.) That image is a filtered one of the pixels
 will do, and this one needs no atomic additions per sample.
 """
 
+from copy import copy
+
 import drjit as dr
 import mitsuba as mi
 
@@ -164,10 +166,19 @@ class FilmSplat:
         dr.eval(result)
         return result
 
-    def adjoint(self, image_adjoint):
-        """Adjoints of the displacement T(u) - u and of det, for an image adjoint.
+    def take(self, index):
+        """The splat of the samples with these numbers, as far as taps are concerned."""
+        result = copy(self)
+        result.u = mi.Point2f(*(dr.gather(mi.Float, x, index) for x in self.u))
+        result.base = mi.Point2i(*(dr.gather(mi.Int32, x, index) for x in self.base))
+        result.values = [dr.gather(mi.Float, v, index) for v in self.values]
+        return result
 
-        ``image_adjoint``: list of ``Float``, one per channel, width pixels.
+    def adjoint(self, image_adjoint, index):
+        """Adjoints of the displacement T(u) - u and of det of some samples, for an image adjoint.
+
+        ``image_adjoint``: list of ``Float``, one per channel, width pixels; ``index``: ``UInt32``, which
+        samples.
         """
         control = self._control()
         product = mi.Float(0)
@@ -176,11 +187,13 @@ class FilmSplat:
         for g, c in zip(image_adjoint, control, strict=True):
             product += dr.gather(mi.Float, g, pixel) * c
         dr.eval(product)
-        own_control = self._half() * dr.opaque(mi.UInt32, self.width * self.height)
+        half = dr.gather(mi.UInt32, self._half(), index)
+        own_control = half * dr.opaque(mi.UInt32, self.width * self.height)
         on_shift, on_det = mi.Vector2f(0), mi.Float(0)
-        for pixel, inside, h, slope, scale in self._taps():
+        some = self.take(index)
+        for pixel, inside, h, slope, scale in some._taps():
             own = mi.Float(0)
-            for g, v in zip(image_adjoint, self.values, strict=True):
+            for g, v in zip(image_adjoint, some.values, strict=True):
                 own += dr.gather(mi.Float, g, pixel, inside) * v
             contrast = (own - dr.gather(mi.Float, product, own_control + pixel, inside)) * scale
             on_shift += slope * contrast

@@ -26,6 +26,9 @@ class GShellMaskIntegrator(ADIntegrator):
         integrator = mi.load_dict({'type': 'gshell_mask'})
     """
 
+    #: What hits nothing is black.
+    hide_emitters = True
+
     def __init__(self, props):
         super().__init__(props)
         self.warp_radius = props.get("warp_radius", 2.0)

@@ -6,50 +6,16 @@ follows the silhouettes. Inside the integral everything is then continuous and o
 differentiation is right.
 """
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
+from .camera_samples import CameraSamples, not_lost
 from .edge_table import scene_edge_tables
 from .film_splat import FilmSplat
 from .pixel_borders import PixelBorders
 from .silhouette_edges import screen_edges
 from .supported_scenes import check_meshes, check_sensor, warn_once
 from .warp import EdgeGrid, FilmWarp, fixed_line_weight
-
-
-@dataclass
-class CameraSamples:
-    """Positions on the film and the other random numbers that a sensor needs."""
-
-    u: object           #: ``Point2f``: pixels relative to the crop window
-    time: object        #: ``Float``
-    wavelength: object  #: ``Float``
-    origin: tuple       #: lowest pixel sampled, relative to the crop window
-    size: tuple         #: extent in pixels of what is sampled
-
-    @staticmethod
-    def draw(sensor, sampler):
-        film = sensor.film()
-        border = film.rfilter().border_size() if film.sample_border() else 0
-        width, height = (int(n) + 2 * border for n in film.crop_size())
-        spp = sampler.sample_count()
-        index = dr.arange(mi.UInt32, width * height * spp) // dr.opaque(mi.UInt32, spp)
-        row = index // dr.opaque(mi.UInt32, width)
-        column = index - row * dr.opaque(mi.UInt32, width)
-        u = mi.Point2f(mi.Float(column), mi.Float(row)) - border + sampler.next_2d()
-        time = mi.Float(sensor.shutter_open())
-        if sensor.shutter_open_time() > 0:
-            time += sampler.next_1d() * sensor.shutter_open_time()
-        wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
-        return CameraSamples(u, time, wavelength, (-border, -border), (width, height))
-
-    def rays(self, sensor, u):
-        """Camera rays through film positions, attached to them and to the sensor."""
-        film = sensor.film()
-        return sensor.sample_ray(self.time, self.wavelength, u / mi.Vector2f(film.crop_size()),
-                                 mi.Point2f(0.5))
 
 
 def film_channels(film, value, alpha, aovs, wavelengths):
@@ -184,15 +150,16 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
     with dr.suspend_grad():
         sensor, sampler, spp, samples = _prepare(integrator, scene, sensor, seed, spp)
         film = sensor.film()
-        state = None
-        if integrator.replays(scene):
-            state, _ = _primal(integrator, scene, sensor, sampler, samples)
         count = len(film_channels(film, mi.Spectrum(0), 0, [], mi.Color0f())) + len(integrator.aov_names())
         image_adjoint = _develop_adjoint(film, grad_in, count, integrator.aov_names())
-        on_values = FilmSplat(film, spp, samples.u).gather(image_adjoint)
-        dr.eval(on_values)
         tables = scene_edge_tables(scene)
         warp = Warp(scene, tables, sensor, samples, integrator)
+        index, traced, sampler = not_lost(integrator, scene, sensor, samples, sampler, warp, seed)
+        on_values = FilmSplat(film, spp, traced.u).gather(image_adjoint)
+        dr.eval(on_values)
+        state = None
+        if integrator.replays(scene):
+            state, _ = _primal(integrator, scene, sensor, sampler, traced)
         outputs = []
         for term in integrator.boundary_terms(scene, tables, sensor, seed):
             on_jump = FilmSplat(film, 1, term.film).gather(image_adjoint)
@@ -200,8 +167,8 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
             with dr.resume_grad():
                 outputs.append(dr.detach(jump) * term.swept(warp))
         with dr.resume_grad():
-            shifted, det = warp(samples.u)
-            ray, weight = samples.rays(sensor, shifted)
+            shifted, _ = warp(traced.u)
+            ray, weight = traced.rays(sensor, shifted)
 
             def on_sample(value, alpha, aovs):
                 channels = film_channels(film, value * weight, alpha, aovs, ray.wavelengths)
@@ -211,19 +178,43 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
             values = film_channels(film, dr.detach(state.value) * dr.detach(weight), dr.detach(state.alpha),
                                    dr.detach(state.aovs), ray.wavelengths)
             dr.schedule(values)     # together with what the traversal evaluates
-            _traverse([*outputs, total], dr.ADFlag.ClearVertices)    # the warp is passed twice
+            # The edges are passed twice.
+            _traverse([*outputs, total], dr.ADFlag.ClearVertices if warp.grid else dr.ADFlag.Default)
             dr.eval(values)
-            with dr.suspend_grad():
-                splat = FilmSplat(film, spp, samples.u, values)
-                on_shift, on_det = splat.adjoint(image_adjoint)
-                borders = _borders(integrator, scene, sensor, warp, seed, spp)
-            outputs = [dr.dot(shifted, on_shift) + det * on_det]
-            if borders is not None:
-                borders, on_border = borders
-                on_flux = borders.adjoint(image_adjoint, on_border, splat.mean_control())
-                outputs.append(borders.flux(warp) * on_flux)
-            _traverse(outputs, dr.ADFlag.Default)
+            if warp.grid is not None:
+                values = _in_place(values, index, dr.width(samples.u))
+                outputs = _outputs_of_warp(integrator, scene, sensor, warp, samples, values, image_adjoint,
+                                           seed, spp)
+                _traverse(outputs, dr.ADFlag.Default)
         dr.eval()
+
+
+def _outputs_of_warp(integrator, scene, sensor, warp, samples, values, image_adjoint, seed, spp):
+    """What the warp does to samples of the given channels, weighted by the image's adjoint."""
+    with dr.suspend_grad():
+        splat = FilmSplat(sensor.film(), spp, samples.u, values)
+        # Kernels for none or one sample would be others.
+        near = dr.compress(warp.is_near(samples.u) | (dr.arange(mi.UInt32, dr.width(samples.u)) < 2))
+        on_shift, on_det = splat.adjoint(image_adjoint, near)
+        borders = _borders(integrator, scene, sensor, warp, seed, spp)
+    shifted, det = warp(splat.take(near).u)
+    outputs = [dr.dot(shifted, on_shift) + det * on_det]
+    if borders is not None:
+        borders, on_border = borders
+        on_flux = borders.adjoint(image_adjoint, on_border, splat.mean_control())
+        outputs.append(borders.flux(warp) * on_flux)
+    return outputs
+
+
+def _in_place(values, index, count):
+    """Numbers of all samples from those of the traced ones; the others' are 0."""
+    if index is None:
+        return values
+    result = [dr.zeros(mi.Float, count) for _ in values]
+    for whole, value in zip(result, values, strict=True):
+        dr.scatter(whole, value, index, mode=dr.ReduceMode.Permute)
+    dr.eval(result)
+    return result
 
 
 def _traverse(outputs, flags):
@@ -239,17 +230,18 @@ def render_forward(integrator, scene, sensor, seed, spp):
     with dr.suspend_grad():
         sensor, sampler, spp, samples = _prepare(integrator, scene, sensor, seed, spp)
         film = sensor.film()
-        state, values = _primal(integrator, scene, sensor, sampler, samples)
         tables = scene_edge_tables(scene)
         warp = Warp(scene, tables, sensor, samples, integrator)
+        index, traced, sampler = not_lost(integrator, scene, sensor, samples, sampler, warp, seed)
+        state, values = _primal(integrator, scene, sensor, sampler, traced)
         boundary = list(integrator.boundary_terms(scene, tables, sensor, seed))
         borders = _borders(integrator, scene, sensor, warp, seed, spp)
         with dr.resume_grad():
             swept = [term.swept(warp) for term in boundary]
             if borders is not None:
                 swept.append(borders[0].flux(warp))
-            shifted, det = warp(samples.u)
-            ray, weight = samples.rays(sensor, shifted)
+            shifted, det = warp(traced.u)
+            ray, weight = traced.rays(sensor, shifted)
 
             def on_sample(value, alpha, aovs):
                 return film_channels(film, value * weight, alpha, aovs, ray.wavelengths)
@@ -257,8 +249,11 @@ def render_forward(integrator, scene, sensor, seed, spp):
             tangents, (shift, divergence, *swept) = integrator.attached(
                 dr.ADMode.Forward, scene, sampler, ray, state, on_sample, (shifted, det, *swept))
         dr.eval(tangents, shift, divergence, swept)
+        count = dr.width(samples.u)
+        values, tangents, shift, [divergence] = (
+            _in_place(part, index, count) for part in (values, tangents, [*shift], [divergence]))
         splat = FilmSplat(film, spp, samples.u, values)
-        image = splat.tangent(tangents, shift, divergence)
+        image = splat.tangent(tangents, mi.Vector2f(*shift), divergence)
         if borders is not None:
             borders[0].scatter(image, swept.pop(), borders[1], splat.mean_control())
         for term, area in zip(boundary, swept, strict=True):
