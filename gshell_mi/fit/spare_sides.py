@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.smoothing import MeshDiffusion
-from ..topology import Topology, mesh_edges, topology, vertex_components
+from ..topology import Topology, mesh_edges, vertex_components
 from .opening import also_opened
 from .template_sides import normals_at_vertices, opposite_sides
 
@@ -30,9 +30,6 @@ _CUT_OFF = 0.1
 
 #: Where there is no opening, a part is a sheet only if one side of it is this fraction of it.
 _SHEET_SHARE = 0.35
-
-#: A part may be a sheet, whatever was opened of its sides, if this much of it is thin or a ridge.
-_PURE_SHEET = 0.9
 
 #: Lambda that smooths the new rims along the mesh, and how spare sides are carried along.
 _SMOOTHING = 3.0
@@ -70,32 +67,23 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
         cell: side of a lattice cell, in the positions' unit.
         sheet_thickness: median thickness, in cells, up to which a part without an opening is a sheet.
     """
-    solid, part = cut.logits > 0, vertex_components(mesh_edges(faces)[0], len(cut.logits))[1]
+    solid = cut.logits > 0
     thickness, opposite = opposite_sides(before, cut.positions, faces, cell)
     normals, smooth = normals_at_vertices(before, faces), MeshDiffusion(faces, len(solid), _SMOOTHING)
-    spare, sheets = spare_sides(thickness, opposite, normals, faces, solid, part, smooth, cell,
-                                sheet_thickness)
+    spare, sheets = spare_sides(thickness, opposite, normals, faces, solid, smooth, cell, sheet_thickness)
     if not spare.any():
         return None
-    whole = np.isin(part, sheets)
-    logits, _ = also_opened(np.where(whole, np.abs(cut.logits), cut.logits), spare, smooth)
-    rest = topology(before, faces[(solid & ~whole)[faces].all(axis=1)])
-    # A sheet with holes is half of a surface with as many handles.
-    loops = sum(_handles(faces[part[faces[:, 0]] == sheet]) + 1 for sheet in sheets)
-    wanted = dataclasses.replace(rest, boundary_loops=rest.boundary_loops + loops,
-                                 components=rest.components + len(sheets))
+    logits, _ = also_opened(cut.logits, spare, smooth)
     thickness, opposite = opposite_sides(before, before, faces, cell)
     opposite = np.where(np.isfinite(thickness), opposite, -1)
-    return Cut(logits, carried(before, cut.positions, spare, opposite, smooth), wanted)
+    return Cut(logits, carried(before, cut.positions, spare, opposite, smooth),
+               dataclasses.replace(cut.topology, boundary_loops=cut.topology.boundary_loops + sheets))
 
 
 def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray, faces: np.ndarray,
-                solid: np.ndarray, part: np.ndarray, smooth: MeshDiffusion, cell: float,
-                sheet_thickness: float) -> tuple[np.ndarray, list[int]]:
+                solid: np.ndarray, smooth: MeshDiffusion, cell: float,
+                sheet_thickness: float) -> tuple[np.ndarray, int]:
     """Sides of thin parts that may go: those beside openings, and one of a part that is nothing but a sheet.
-
-    Either side of a sheet explains the images, and a ghost may open patches of both. So where a part is thin
-    all over, its openings are closed first.
 
     Args:
         thickness: (V,) of the template under each vertex; infinite where there is no other side.
@@ -103,48 +91,38 @@ def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray
         normals: (V, 3) of the template before it moved.
         faces: (F, 3) of the template.
         solid: (V,) False where the template is open.
-        part: (V,) number of the connected part that a vertex belongs to.
         smooth: along the mesh.
         cell: side of a lattice cell, in the unit of ``thickness``.
         sheet_thickness: median thickness, in cells, up to which a part without an opening is a sheet.
 
     Returns:
-        (V,) whether a vertex may be opened too, and the parts that are sheets.
+        (V,) whether a vertex may be opened too, and how many parts without an opening are sheets.
     """
     edges, _ = mesh_edges(faces)
     facing_away = np.einsum("nj,nj->n", normals, normals[opposite]) < -_FLAT
-    thin, found_open = (thickness < _THIN * cell) & facing_away, ~solid
-    pure = np.bincount(part, _with_ridges(thin, edges)) > _PURE_SHEET * np.bincount(part)
-    solid = solid | pure[part]
-    thin &= solid & solid[opposite]
+    thin = solid & solid[opposite] & (thickness < _THIN * cell) & facing_away
+    part = vertex_components(edges, len(solid))[1]
     closed = (np.bincount(part, ~solid) == 0)[part]
     candidates = np.flatnonzero(thin & closed)
-    first = closed & _one_side(thin, found_open, normals, edges, part)
-    opened = _grown(~solid | first, thin, opposite, edges)
+    opened = _grown(~solid | closed & _one_side(thin, normals, edges, part), thin, opposite, edges)
     opened |= _cut_off(opened, solid, edges)
     spare = solid & (_balanced(opened, thin, opposite, edges, smooth) < 0)
     # A fin of something solid is no sheet, nor is a plate, whose sides stay apart.
     share = np.bincount(part, spare) / np.maximum(np.bincount(part, solid), 1)
     sheets = [index for index in np.unique(part[candidates]) if share[index] > _SHEET_SHARE
               and np.median(thickness[candidates[part[candidates] == index]]) < sheet_thickness * cell]
-    return spare & (~closed | np.isin(part, sheets)), sheets
+    return spare & (~closed | np.isin(part, sheets)), len(sheets)
 
 
-def _handles(faces: np.ndarray) -> int:
-    """Genus of a connected closed surface, by its Euler characteristic."""
-    return 1 - (len(np.unique(faces)) - len(mesh_edges(faces)[0]) + len(faces)) // 2
-
-
-def _one_side(thin: np.ndarray, opened: np.ndarray, normals: np.ndarray, edges: np.ndarray,
-              part: np.ndarray) -> np.ndarray:
-    """(V,) of each part's thin vertices the patch without a ridge that is opened most, or the largest."""
+def _one_side(thin: np.ndarray, normals: np.ndarray, edges: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """(V,) of the thin vertices of each part the largest patch without a ridge."""
     start, end = edges.T
     flat = thin[start] & thin[end] & (np.einsum("nj,nj->n", normals[start], normals[end]) > _FLAT)
     patch = vertex_components(edges[flat], len(thin))[1]
-    size = np.bincount(patch, thin) + len(thin) * np.bincount(patch, thin & opened)
+    size = np.bincount(patch, thin)
     largest = np.zeros(len(thin))
     np.maximum.at(largest, part, size[patch])
-    # Of equal patches, the first.
+    # Of patches of one size, the first.
     chosen = np.flatnonzero(thin & (size[patch] == largest[part]))
     first = patch[chosen[np.unique(part[chosen], return_index=True)[1]]]
     return thin & np.isin(patch, first)
@@ -178,7 +156,10 @@ def _cut_off(opened: np.ndarray, solid: np.ndarray, edges: np.ndarray) -> np.nda
 def _balanced(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges: np.ndarray,
               smooth: MeshDiffusion) -> np.ndarray:
     """(V,) negative where open: smooth along the mesh, of opposite sign on the two sides of thin parts."""
-    free, signs = _with_ridges(thin, edges), np.where(opened, -1.0, 1.0)
+    signs = np.where(opened, -1.0, 1.0)
+    free = thin
+    for _ in range(_RIDGE):
+        free = free | _beside(free, edges)
     result = signs
     for _ in range(_BALANCINGS):
         result = smooth(mi.Float(result.astype(np.float32))).numpy()
@@ -205,13 +186,6 @@ def carried(before: np.ndarray, moved: np.ndarray, spare: np.ndarray, opposite: 
     columns = [smooth(mi.Float(column.astype(np.float32))).numpy() for column in (known, *movement.T)]
     spread = np.stack(columns[1:], axis=1) / np.maximum(columns[0], 1e-6)[:, None]
     return np.where(spare[:, None], before + spread, moved)
-
-
-def _with_ridges(thin: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """(V,) thin vertices and the ridges between them."""
-    for _ in range(_RIDGE):
-        thin = thin | _beside(thin, edges)
-    return thin
 
 
 def _beside(chosen: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -98,22 +98,6 @@ def test_an_opening_grows_over_the_side_that_it_is_in():
     assert found.topology.boundary_loops == 1
 
 
-def test_a_sheet_with_holes_that_is_open_on_either_side_keeps_one():
-    points = TetLattice(RESOLUTION).vertex_positions()
-    x, y = points[:, 0], points[:, 1]
-    holes = np.minimum(np.hypot(x - 0.25, y), np.hypot(x + 0.25, y)) - 0.16
-    vertices, faces = template(np.maximum(np.maximum(np.abs(points[:, 2] - HEIGHT) - 0.8 * CELL, -holes),
-                                          np.hypot(x, y) - RADIUS))
-    x, upper = vertices[:, 0], vertices[:, 2] > HEIGHT
-    solid = ~(upper & (x > 0.45) | ~upper & (x < -0.45))
-    found = cut(vertices, flattened(vertices, 0.2), faces, solid)
-    assert (found.topology.boundary_loops, found.topology.components) == (3, 1)
-    subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
-    fields = recast(subject, vertices, found.positions, faces, found.logits, np.ones((len(vertices), 3)),
-                    0.005, found.topology)
-    assert fields, "its surface has just those loops"
-
-
 def test_spare_sides_follow_those_that_stay():
     vertices, faces = plate()
     moved = flattened(vertices, 0.2) + np.array([0, 0, CELL])
