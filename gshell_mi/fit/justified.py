@@ -49,9 +49,10 @@ def close_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np
     closed_error = error(np.ones_like(opened))
     for closing in range(_CLOSINGS):
         patch = _lobes(opened, faces)
-        ratios = _ratios(closed_error, error(~opened), patch) / gain
+        ratios = _ratios(closed_error, error(~opened), patch)
         small = np.bincount(patch) < _SMALL * len(opened)
-        excess = np.where(small, ratios.max(axis=0) / _STRICTER, ratios[0])
+        # At a gain of 0 nothing is justified.
+        excess = np.where(small, ratios.max(axis=0) / _STRICTER, ratios[0]) / max(gain, 1e-30)
         excess[np.bincount(patch, opened) == 0] = 0
         if not (excess > 1).any():
             break

@@ -36,6 +36,13 @@ def test_an_opening_stays_if_it_explains_the_images(ball):
     np.testing.assert_array_equal(close_unjustified(logits, ball.faces, error, gain=0.95), logits)
 
 
+def test_at_a_gain_of_nothing_all_openings_close(ball):
+    up = cap(ball, [0, 0, 1], 0.1)
+    result = close_unjustified(np.where(up, -1.0, 2.0), ball.faces,
+                               lambda opaque: np.where(opaque, 1.0, 1e-6)[None], gain=0.0)
+    assert (result > 0).all()
+
+
 def test_the_error_counts_per_opening_not_per_vertex(ball):
     """Half of an opening's vertices may get worse if the other half gains more."""
     up = cap(ball, [0, 0, 1], 0.1)
