@@ -6,6 +6,7 @@ import trimesh
 
 from .. import compat
 from ..lattice import Lattice
+from ..triangles import unit
 
 
 def separate_layers(sdf: np.ndarray, mesh: trimesh.Trimesh, lattice: Lattice, band: np.ndarray) -> None:
@@ -46,9 +47,8 @@ def _beyond_rims(mesh: trimesh.Trimesh, width: float) -> tuple[np.ndarray, np.nd
     direction = np.zeros((len(mesh.vertices), 3))
     for end in (a, b):
         np.add.at(direction, end, outward)
-    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
     rim, local = np.unique([a, b], return_inverse=True)
     c, d = local.reshape(2, -1) + len(mesh.vertices)
     strips = np.concatenate([np.stack([b, a, c], axis=1), np.stack([b, c, d], axis=1)])
-    beyond = mesh.vertices[rim] + width * direction[rim]
+    beyond = mesh.vertices[rim] + width * unit(direction[rim])
     return np.concatenate([mesh.vertices, beyond]), np.concatenate([mesh.faces, strips])

@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 
 from ..lattice import CubicGrid, Lattice
+from ..triangles import unit
 
 _PAIRS = 1 << 22  # vertices times triangles at once: some 200 MiB
 
@@ -132,7 +133,7 @@ class MeshFeet:
             vertex = mesh.faces[face[at_corner], i]
             normal[at_corner] = mesh.vertex_normals[vertex]
             on_rim[at_corner] = self._vertex_on_rim[vertex]
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+        normal = unit(normal)
         offset = points - foot
         height = np.einsum("ij,ij->i", offset, normal)
         return Feet(foot, face, np.linalg.norm(offset, axis=1), normal, height, on_rim)

@@ -38,7 +38,7 @@ def rim_cut(fields: LatticeFields, feet_of: MeshFeet, nearest: np.ndarray, rim: 
     template = extract(lattice, mi.Float(fields.sdf))
     faces = template.to_numpy()[1]
     edges, _ = mesh_edges(faces)
-    wanted, beside_rim, cut = _rim_distance(template, lattice, feet_of, nearest, rim)
+    wanted, beside_rim, cut = _rim_distance(template, edges, lattice, feet_of, nearest, rim)
     entries = [tuple(np.array(x) for x in entry) for entry in dr.detach(template.stencil.entries())]
     row, column, weight = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     used, column = np.unique(column, return_inverse=True)
@@ -84,13 +84,13 @@ def rim_cut(fields: LatticeFields, feet_of: MeshFeet, nearest: np.ndarray, rim: 
 
 
 def _rim_distance(
-    template: SurfaceMesh, lattice: Lattice, feet_of: MeshFeet, nearest: np.ndarray, rim: np.ndarray
+    template: SurfaceMesh, edges: np.ndarray, lattice: Lattice, feet_of: MeshFeet, nearest: np.ndarray,
+    rim: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Signed distance to the rims along the mesh at the vertices of the template, which of these are near
     a rim, and which are cut as they lead from one layer to another."""
     h = lattice.spacing
     vertices, faces, _ = template.to_numpy()
-    edges, _ = mesh_edges(faces)
     normals = np.array(dr.detach(template.vertex_normals())).T
     strides = np.array([1, lattice.stride, lattice.stride**2])
     cube = np.array(list(np.ndindex(2, 2, 2))) @ strides

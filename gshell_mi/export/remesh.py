@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..topology import mesh_edges, topology
-from ..triangles import face_areas
+from ..triangles import face_areas, unit
 
 _PASSES = 10
 
@@ -229,5 +229,4 @@ def _edge_index(edges: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _normals(corners: np.ndarray) -> np.ndarray:
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))

@@ -36,14 +36,18 @@ class CameraSamples:
         """The samples with these numbers."""
         time, wavelength = (x if dr.width(x) == 1 else dr.gather(mi.Float, x, index)
                             for x in (self.time, self.wavelength))
-        u = mi.Point2f(*(dr.gather(mi.Float, x, index) for x in self.u))
-        return CameraSamples(u, time, wavelength, self.origin, self.size)
+        return CameraSamples(dr.gather(mi.Point2f, self.u, index), time, wavelength, self.origin, self.size)
 
     def rays(self, sensor, u):
         """Camera rays through film positions, attached to them and to the sensor."""
         film = sensor.film()
         return sensor.sample_ray(self.time, self.wavelength, u / mi.Vector2f(film.crop_size()),
                                  mi.Point2f(0.5))
+
+
+def numbers_of(selected):
+    """The numbers of the selected samples, and the first two: kernels for none or one would be others."""
+    return dr.compress(selected | (dr.arange(mi.UInt32, dr.width(selected)) < 2))
 
 
 def not_lost(integrator, scene, sensor, samples, sampler, warp, seed):
@@ -57,12 +61,9 @@ def not_lost(integrator, scene, sensor, samples, sampler, warp, seed):
     black = integrator.hide_emitters or scene.environment() is None
     if not black or sensor.sampler().class_name() != "IndependentSampler":
         return None, samples, sampler
-    count = dr.width(samples.u)
     ray, _ = samples.rays(sensor, samples.u)
-    # Kernels for none or one sample would be others.
-    kept = scene.ray_test(ray) | warp.is_near(samples.u)
-    index = dr.compress(kept | (dr.arange(mi.UInt32, count) < 2))
-    if dr.width(index) == count:
+    index = numbers_of(scene.ray_test(ray) | warp.is_near(samples.u))
+    if dr.width(index) == dr.width(samples.u):
         return None, samples, sampler
     taken = samples.take(index)
     own = sampler.clone()

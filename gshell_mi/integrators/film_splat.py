@@ -109,7 +109,7 @@ class FilmSplat:
         pixel = dr.arange(mi.UInt32, self.width * self.height)
         y = pixel // dr.opaque(mi.UInt32, self.width)
         x = pixel - y * dr.opaque(mi.UInt32, self.width)
-        half_of = self._half()
+        half_of = self._half(dr.arange(mi.UInt32, dr.width(self.u)))
         result = [dr.zeros(mi.Float, 2 * self.width * self.height) for _ in self.values]
         if spp < 2:
             return result
@@ -143,9 +143,8 @@ class FilmSplat:
         return [share * dr.gather(mi.Float, c, pixel) + (1 - share) * dr.gather(mi.Float, c, second)
                 for c in self._control()]
 
-    def _half(self):
-        """Which half each sample belongs to."""
-        index = dr.arange(mi.UInt32, dr.width(self.u))
+    def _half(self, index):
+        """Which half the samples with these numbers belong to."""
         spp = dr.opaque(mi.UInt32, self.spp)
         return (index - index // spp * spp) & 1
 
@@ -169,8 +168,8 @@ class FilmSplat:
     def take(self, index):
         """The splat of the samples with these numbers, as far as taps are concerned."""
         result = copy(self)
-        result.u = mi.Point2f(*(dr.gather(mi.Float, x, index) for x in self.u))
-        result.base = mi.Point2i(*(dr.gather(mi.Int32, x, index) for x in self.base))
+        result.u = dr.gather(mi.Point2f, self.u, index)
+        result.base = dr.gather(mi.Point2i, self.base, index)
         result.values = [dr.gather(mi.Float, v, index) for v in self.values]
         return result
 
@@ -187,8 +186,7 @@ class FilmSplat:
         for g, c in zip(image_adjoint, control, strict=True):
             product += dr.gather(mi.Float, g, pixel) * c
         dr.eval(product)
-        half = dr.gather(mi.UInt32, self._half(), index)
-        own_control = half * dr.opaque(mi.UInt32, self.width * self.height)
+        own_control = self._half(index) * dr.opaque(mi.UInt32, self.width * self.height)
         on_shift, on_det = mi.Vector2f(0), mi.Float(0)
         some = self.take(index)
         for pixel, inside, h, slope, scale in some._taps():
@@ -203,7 +201,8 @@ class FilmSplat:
     def tangent(self, value_tangents, shift, divergence):
         """The image tangent for tangents of the values, of T(u) - u and of det."""
         control = self._control()
-        own_control = self._half() * dr.opaque(mi.UInt32, self.width * self.height)
+        half = self._half(dr.arange(mi.UInt32, dr.width(self.u)))
+        own_control = half * dr.opaque(mi.UInt32, self.width * self.height)
         result = [dr.zeros(mi.Float, self.width * self.height) for _ in self.values]
         for pixel, inside, h, slope, scale in self._taps():
             moved = dr.dot(slope, shift) + h * divergence

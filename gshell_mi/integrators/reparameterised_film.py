@@ -9,7 +9,7 @@ differentiation is right.
 import drjit as dr
 import mitsuba as mi
 
-from .camera_samples import CameraSamples, not_lost
+from .camera_samples import CameraSamples, not_lost, numbers_of
 from .edge_table import scene_edge_tables
 from .film_splat import FilmSplat
 from .pixel_borders import PixelBorders
@@ -193,8 +193,7 @@ def _outputs_of_warp(integrator, scene, sensor, warp, samples, values, image_adj
     """What the warp does to samples of the given channels, weighted by the image's adjoint."""
     with dr.suspend_grad():
         splat = FilmSplat(sensor.film(), spp, samples.u, values)
-        # Kernels for none or one sample would be others.
-        near = dr.compress(warp.is_near(samples.u) | (dr.arange(mi.UInt32, dr.width(samples.u)) < 2))
+        near = numbers_of(warp.is_near(samples.u))
         on_shift, on_det = splat.adjoint(image_adjoint, near)
         borders = _borders(integrator, scene, sensor, warp, seed, spp)
     shifted, det = warp(splat.take(near).u)

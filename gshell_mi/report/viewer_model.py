@@ -10,6 +10,7 @@ from ..export.asset import y_up_turn
 from ..export.gltf import Part, glb_bytes, read_part
 from ..export.ply import read_ply
 from ..topology import mesh_edges
+from ..triangles import unit
 from ..turntable.looks import ORANGE
 
 _TUBE_SIDES = 5
@@ -61,10 +62,8 @@ def boundary_tubes(vertices: np.ndarray, faces: np.ndarray,
     if len(edges) == 0:
         return None
     start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
-    along = end - start
-    along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-20)
-    across = np.cross(along, np.eye(3)[np.abs(along).argmin(1)])
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-20)
+    along = unit(end - start)
+    across = unit(np.cross(along, np.eye(3)[np.abs(along).argmin(1)]))
     other = np.cross(along, across)
     angle = 2 * np.pi * np.arange(_TUBE_SIDES) / _TUBE_SIDES
     ring = radius * (np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * other[:, None])

@@ -2,20 +2,10 @@
 
 import numpy as np
 import pytest
-import trimesh
+from cap import cap
 
 from gshell_mi.fit.justified import close_unjustified, open_unjustified
 from gshell_mi.topology import equal_patches
-
-
-@pytest.fixture(scope="module")
-def ball() -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(4)
-
-
-def cap(ball: trimesh.Trimesh, axis, share: float) -> np.ndarray:
-    """Vertices in a cap with this share of the sphere's area."""
-    return ball.vertices @ np.array(axis, float) > 1 - 2 * share
 
 
 def test_an_opening_stays_if_it_explains_the_images(ball):

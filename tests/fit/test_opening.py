@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import trimesh
+from cap import cap
 from topology import assert_manifold, loop_count
 
 from gshell_mi.extraction import extract
@@ -16,16 +16,6 @@ from gshell_mi.fit.opening import (
     without_specks,
 )
 from gshell_mi.lattice import TetLattice
-
-
-@pytest.fixture(scope="module")
-def ball() -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(4)
-
-
-def cap(ball: trimesh.Trimesh, axis, share: float) -> np.ndarray:
-    """Vertices in a cap with this share of the sphere's area."""
-    return ball.vertices @ np.array(axis, float) > 1 - 2 * share
 
 
 def test_small_cuts_and_islands_are_undone(ball):
