@@ -172,7 +172,7 @@ class FitConfig:
     """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
     material_gradient_smoothing: float = 1.0
     """Lambda of the material's Sobolev gradient on the lattice; spreads colour to what few pixels see."""
-    material_lr: float = 0.1
+    material_lr: float = 0.2
     """Adam's step for base colour, roughness and metallic (logits)."""
     light_lr: float = 0.1
     """Adam's step for the environment map (logarithm of its radiance)."""
