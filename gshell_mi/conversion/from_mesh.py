@@ -75,12 +75,11 @@ def from_mesh(
     sdf[border] = np.maximum(np.abs(sdf), h / 2)[border]  # the template closes inside the lattice
 
     fields = LatticeFields.closed(sdf, lattice.grid)
-    rim = feet_of.rim_samples(h / 8)
-    if len(rim) == 0:
+    if len(feet_of.rim_edges) == 0:
         return fields
     nearest = np.full(lattice.vertex_count, -1)
     nearest[band] = face
-    msdf = rim_cut(fields, feet_of, nearest, rim)
+    msdf = rim_cut(fields, feet_of, nearest, *feet_of.rim_samples(h / 8))
     return LatticeFields(fields.sdf, msdf, fields.deform, lattice.grid)
 
 

@@ -6,7 +6,14 @@ import trimesh
 
 from .. import compat
 from ..lattice import Lattice
+from ..topology import vertex_components
 from ..triangles import unit
+
+#: Of a cube's faces, between corners; those from its lowest corner are edges of every lattice.
+_OTHER_DIAGONALS = [(1, 2), (1, 4), (2, 4)]
+
+#: Vertices of one sign, at most, that make a bubble.
+_BUBBLE = 2
 
 
 def separate_layers(sdf: np.ndarray, mesh: trimesh.Trimesh, lattice: Lattice, band: np.ndarray) -> None:
@@ -20,22 +27,48 @@ def separate_layers(sdf: np.ndarray, mesh: trimesh.Trimesh, lattice: Lattice, ba
     inner = band[(np.abs(lattice.vertex_positions()[band]) < 1 - 1.5 * lattice.spacing).all(axis=1)]
     spacing = lattice.spacing
     flips = []
-    for corner in range(1, 8):
-        step = [corner & 1, corner >> 1 & 1, corner >> 2] @ lattice.cell_vectors
-        other = lattice.corner(mi.UInt32(inner.astype(np.uint32)), mi.UInt32(corner)).numpy().astype(int)
-        alike = (sdf[inner] < 0) == (sdf[other] < 0)
-        a, b = inner[alike], other[alike]
+    pairs = [(0, corner) for corner in range(1, 8)]
+    if lattice.grid in ("cube", "flexicubes"):
+        pairs += _OTHER_DIAGONALS
+    start = mi.UInt32(inner.astype(np.uint32))
+    for first, last in pairs:
+        step = (_steps(last) - _steps(first)) @ lattice.cell_vectors
+        a, b = (lattice.corner(start, mi.UInt32(c)).numpy().astype(int) for c in (first, last))
+        alike = (sdf[a] < 0) == (sdf[b] < 0)
+        a, b = a[alike], b[alike]
         hits = []
-        for start, way in ((a, 1), (b, -1)):
-            origin = lattice.positions_of(mi.UInt32(start.astype(np.uint32)), mi.Float)
+        for begin, way in ((a, 1), (b, -1)):
+            origin = lattice.positions_of(mi.UInt32(begin.astype(np.uint32)), mi.Float)
             ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(*(way * step).tolist()))
             ray.maxt = mi.Float(1)
             hits.append(scene.ray_intersect_preliminary(ray).t.numpy())
         twice = np.isfinite(hits[0]) & np.isfinite(hits[1]) & (hits[0] < 1 - hits[1] - 1e-3)
         flips.append(np.where(hits[0] <= hits[1], a, b)[twice])
     flipped = np.unique(np.concatenate(flips))
-    depth = np.abs(sdf[flipped]).clip(1e-3 * spacing, 0.1 * spacing)
-    sdf[flipped] = np.where(sdf[flipped] < 0, depth, -depth)
+    _turn(sdf, flipped, spacing)
+    _turn(sdf, _bubbles(sdf, lattice, band), spacing)
+
+
+def _turn(sdf: np.ndarray, vertices: np.ndarray, spacing: float) -> None:
+    """Changes the sign of vertices, which come to lie close to the surface, in place."""
+    depth = np.abs(sdf[vertices]).clip(1e-3 * spacing, 0.1 * spacing)
+    sdf[vertices] = np.where(sdf[vertices] < 0, depth, -depth)
+
+
+def _bubbles(sdf: np.ndarray, lattice: Lattice, band: np.ndarray) -> np.ndarray:
+    """Vertices that few others of their sign hang together with: they tell no layers apart."""
+    slot = np.full(lattice.vertex_count, -1)
+    slot[band] = np.arange(len(band))
+    pairs = np.concatenate([np.stack([band, x.numpy().astype(int)], axis=1)
+                            for x in lattice.neighbours(mi.UInt32(band.astype(np.uint32)))])
+    pairs = slot[pairs[(sdf[pairs[:, 0]] < 0) == (sdf[pairs[:, 1]] < 0)]]
+    piece = vertex_components(pairs[pairs[:, 1] >= 0], len(band))[1]
+    return band[np.bincount(piece)[piece] <= _BUBBLE]
+
+
+def _steps(corner: int) -> np.ndarray:
+    """Steps along the cell's vectors to one of its corners."""
+    return np.array([corner & 1, corner >> 1 & 1, corner >> 2])
 
 
 def _beyond_rims(mesh: trimesh.Trimesh, width: float) -> tuple[np.ndarray, np.ndarray]:

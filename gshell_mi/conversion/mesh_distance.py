@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 
 from ..lattice import CubicGrid, Lattice
+from ..topology import vertex_components
 from ..triangles import unit
 
 _PAIRS = 1 << 22  # vertices times triangles at once: some 200 MiB
@@ -138,10 +139,11 @@ class MeshFeet:
         height = np.einsum("ij,ij->i", offset, normal)
         return Feet(foot, face, np.linalg.norm(offset, axis=1), normal, height, on_rim)
 
-    def rim_samples(self, spacing: float) -> np.ndarray:
-        """Points along the rims, no farther apart than ``spacing``."""
+    def rim_samples(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        """Points along the rims, no farther apart than ``spacing``, (n, 3), and the loops of each, (n,)."""
         start, end = (self.mesh.vertices[self.rim_edges[:, i]] for i in (0, 1))
         steps = np.ceil(np.linalg.norm(end - start, axis=1) / spacing).astype(int) + 1
         edge = np.repeat(np.arange(len(start)), steps)
         t = (np.arange(len(edge)) - np.repeat(np.cumsum(steps) - steps, steps)) / np.repeat(steps, steps)
-        return start[edge] + t[:, None] * (end - start)[edge]
+        loop = vertex_components(self.rim_edges, len(self.mesh.vertices))[1][self.rim_edges[:, 0]]
+        return start[edge] + t[:, None] * (end - start)[edge], loop[edge]

@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 from ..extraction import SurfaceMesh, extract
 from ..fields import LatticeFields
 from ..lattice import Lattice
-from ..topology import equal_patches, mesh_edges
+from ..topology import equal_patches, mesh_edges, vertex_components
 from .bridges import bridges
 from .mesh_distance import MeshFeet
+from .necks import necks
 
 # A point of the template is on the mesh if it is this near and faces the same way. An edge that crosses
 # the mesh is at most sqrt(3) cells long, and its crossing is found to a fraction of it.
@@ -22,10 +23,13 @@ _SIGN_ROUNDS = 12  # of fitting the mSDF, each with more weight on what has the 
 _DAMPING = 1e-2  # weight of the start of the fit, so that it has one solution
 _SPECK = 12  # patches of fewer vertices have the wrong sign
 _UNEXPLAINED = 0.02  # as have those of a smaller fraction of the template's vertices and far from any rim
+_NECK_CELLS = 6.0  # a rim that became several loops is joined again over no longer a way
 _BRIDGE_CELLS = 3.0  # ends of an edge on the surface are no farther from each other along the mesh
 
 
-def rim_cut(fields: LatticeFields, feet_of: MeshFeet, nearest: np.ndarray, rim: np.ndarray) -> np.ndarray:
+def rim_cut(
+    fields: LatticeFields, feet_of: MeshFeet, nearest: np.ndarray, rim: np.ndarray, loop: np.ndarray
+) -> np.ndarray:
     """The mSDF (n,) that interpolates to the distance to the rims at the vertices of the template, nearly.
 
     Args:
@@ -33,12 +37,14 @@ def rim_cut(fields: LatticeFields, feet_of: MeshFeet, nearest: np.ndarray, rim: 
         feet_of: of the mesh.
         nearest: the face nearest to each lattice vertex, -1 where it is far.
         rim: samples of the rims, (n, 3).
+        loop: the rim that each sample is on, (n,).
     """
     lattice = fields.lattice
     template = extract(lattice, mi.Float(fields.sdf))
-    faces = template.to_numpy()[1]
+    vertices, faces, _ = template.to_numpy()
     edges, _ = mesh_edges(faces)
     wanted, beside_rim, cut = _rim_distance(template, edges, lattice, feet_of, nearest, rim)
+    rims = cKDTree(rim)
     entries = [tuple(np.array(x) for x in entry) for entry in dr.detach(template.stencil.entries())]
     row, column, weight = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     used, column = np.unique(column, return_inverse=True)
@@ -48,7 +54,13 @@ def rim_cut(fields: LatticeFields, feet_of: MeshFeet, nearest: np.ndarray, rim: 
     start = (interpolate.T @ wanted) / share
     importance = np.ones(template.vertex_count)
     values = start
-    for _ in range(_SIGN_ROUNDS):
+
+    def at_lattice(values: np.ndarray) -> np.ndarray:
+        msdf = np.full(lattice.vertex_count, -lattice.spacing, np.float32)
+        msdf[used] = values
+        return msdf
+
+    for turn in range(_SIGN_ROUNDS):
         normal = interpolate.T @ diags_array(importance) @ interpolate + _DAMPING * diags_array(share)
         right = interpolate.T @ (importance * wanted) + _DAMPING * share * start
         jacobi = diags_array(1 / normal.diagonal())
@@ -56,20 +68,23 @@ def rim_cut(fields: LatticeFields, feet_of: MeshFeet, nearest: np.ndarray, rim: 
         found = interpolate @ values
         patches = _Patches(found, faces)
         speck = patches.specks(wanted)
-        # A cut between layers that ends within the sheet is a pin-hole: it grows until it meets a cap.
-        short = speck & (found < 0) & patches.holding(cut)
-        if short.any():
-            speck &= ~short
-            grown = edges[short[edges].any(axis=1)].ravel()
-            cut[grown], wanted[grown] = True, -0.25 * lattice.spacing
+        speck &= (found > 0) | ~patches.holding(cut)  # what has been cut stays so, and meets the rim by a neck
         # Where caps and layers share lattice vertices, caps prevail at the rims, so that these do not run
         # into each other, and the mesh elsewhere. Nothing small is left over.
         missed = ((found > 0) != (wanted > 0)) & (beside_rim != (wanted > 0))
-        if not speck.any() and not missed.any() and not short.any():
+        settled = not speck.any() and not missed.any()
+        neck = np.zeros(0, int)
+        if settled or turn >= _SIGN_ROUNDS / 2:
+            border, of_loop = _loops(extract(lattice, mi.Float(fields.sdf), mi.Float(at_lattice(values))))
+            neck = necks(vertices, edges, found > 0, border, of_loop, loop[rims.query(border)[1]],
+                         _NECK_CELLS * lattice.spacing)
+            cut[neck], wanted[neck] = True, -0.25 * lattice.spacing
+        if settled and not len(neck):
             break
         importance[missed] *= 8
         wanted[speck] = np.where(found[speck] > 0, -0.25, 0.25) * lattice.spacing
         importance[speck] *= 8
+        importance[neck] *= 8
     for _ in range(_SIGN_ROUNDS):  # what the fit could not remove goes by force
         found = interpolate @ values
         speck = np.flatnonzero(_Patches(found, faces).specks(wanted))
@@ -78,9 +93,15 @@ def rim_cut(fields: LatticeFields, feet_of: MeshFeet, nearest: np.ndarray, rim: 
         ends = interpolate[speck].tocoo()
         turned = np.copysign(0.1 * lattice.spacing, -found[speck])
         values[ends.coords[1]] = turned[ends.coords[0]]
-    msdf = np.full(lattice.vertex_count, -lattice.spacing, np.float32)
-    msdf[used] = values
-    return msdf
+    return at_lattice(values)
+
+
+def _loops(surface: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices on the boundary of a surface, (n, 3), and the loop that each is on, (n,)."""
+    vertices, faces, _ = surface.to_numpy()
+    edges, uses = mesh_edges(faces)
+    ends, local = np.unique(edges[uses == 1], return_inverse=True)
+    return vertices[ends], vertex_components(local.reshape(-1, 2), len(ends))[1]
 
 
 def _rim_distance(

@@ -113,6 +113,20 @@ def test_layers_closer_than_a_cell_stay_apart(grid, gap):
         assert (loop_count(faces), component_count(faces), euler_characteristic(faces)) == (1, 1, 1)
 
 
+@pytest.mark.parametrize("gap", [0.7, 1.1])
+@pytest.mark.parametrize("axis", [(1, 1, 1), (1, -1, 1), (1, 2, 3)])
+@pytest.mark.parametrize("grid", ["cube", "flexicubes"])
+def test_oblique_layers_in_cubes_stay_apart(grid, axis, gap):
+    lattice = make_lattice(grid, LATTICE.resolution)
+    for angle in (-0.785, 0.4):
+        mesh = _fold(gap * lattice.spacing)
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(angle, axis))
+        mesh.apply_scale(0.8 / np.abs(mesh.vertices).max())
+        fields = from_mesh(mesh, lattice)
+        _, faces, _ = extract(lattice, mi.Float(fields.sdf), mi.Float(fields.msdf)).to_numpy()
+        assert (loop_count(faces), component_count(faces), euler_characteristic(faces)) == (1, 1, 1)
+
+
 def _pinched_tube():
     """A tube whose lower rim is drawn in to the shape of an eight, so that it touches itself in a point."""
 

@@ -43,7 +43,9 @@ def test_feet(sheet):
 
 
 def test_rim_samples(sheet):
-    samples = MeshFeet(sheet).rim_samples(0.05)
+    samples, loop = MeshFeet(sheet).rim_samples(0.05)
+    assert len(loop) == len(samples)
+    assert len(np.unique(loop)) == 1
     on_bottom = np.isclose(samples[:, 2], 0.1)
     assert np.abs(samples[on_bottom][:, :2]).max(axis=1) == pytest.approx(0.5)
     order = samples[np.isclose(samples[:, 0], -0.5)][:, 1]
