@@ -68,7 +68,7 @@ def rim_cut(
         found = interpolate @ values
         patches = _Patches(found, faces)
         speck = patches.specks(wanted)
-        speck &= (found > 0) | ~patches.holding(cut)  # what has been cut stays so, and meets the rim by a neck
+        speck &= (found > 0) | ~patches.holding(cut)  # what has been cut stays cut
         # Where caps and layers share lattice vertices, caps prevail at the rims, so that these do not run
         # into each other, and the mesh elsewhere. Nothing small is left over.
         missed = ((found > 0) != (wanted > 0)) & (beside_rim != (wanted > 0))

@@ -60,5 +60,5 @@ def test_rims_stay_apart():
     vertices, faces, x, y = square()
     positive = ~holes(x, y, [(5, 5), (12, 5)])
     assert len(found(vertices, faces, positive, (x > 8).astype(int), 4.0)) == 0
-    assert len(found(vertices, faces, positive, np.zeros(len(vertices), int), 1.0)) == 0, "the wall is thicker"
+    assert len(found(vertices, faces, positive, np.zeros(len(vertices), int), 1.0)) == 0, "a thicker wall"
     assert len(found(vertices, faces, np.ones(len(vertices), bool), np.zeros(len(vertices), int), 4.0)) == 0
