@@ -73,6 +73,7 @@ def rim_cut(
         # into each other, and the mesh elsewhere. Nothing small is left over.
         missed = ((found > 0) != (wanted > 0)) & (beside_rim != (wanted > 0))
         settled = not speck.any() and not missed.any()
+        # Rims are looked at once the signs are right, or the fit has had its time to set them right.
         neck = np.zeros(0, int)
         if settled or turn >= _SIGN_ROUNDS / 2:
             border, of_loop = _loops(extract(lattice, mi.Float(fields.sdf), mi.Float(at_lattice(values))))
