@@ -21,7 +21,7 @@ def separate_layers(sdf: np.ndarray, mesh: trimesh.Trimesh, lattice: Lattice, ba
 
     An edge of the lattice that crosses the mesh twice has ends of one sign. The end nearer to the middle
     between the crossings takes the other sign, which moves the layer in front of it by half an edge at most.
-    Vertices that are then alone with their sign, or two of them, would be bubbles of the template and turn too.
+    One or two vertices that are then alone with their sign would be bubbles of the template, and turn too.
     """
     vertices, faces = _beyond_rims(mesh, lattice.spacing)
     scene = compat.mesh_scene(vertices, faces)
