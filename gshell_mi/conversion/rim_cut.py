@@ -43,8 +43,8 @@ def rim_cut(
     template = extract(lattice, mi.Float(fields.sdf))
     vertices, faces, _ = template.to_numpy()
     edges, _ = mesh_edges(faces)
-    wanted, beside_rim, cut = _rim_distance(template, edges, lattice, feet_of, nearest, rim)
     rims = cKDTree(rim)
+    wanted, beside_rim, cut = _rim_distance(template, edges, lattice, feet_of, nearest, rims)
     entries = [tuple(np.array(x) for x in entry) for entry in dr.detach(template.stencil.entries())]
     row, column, weight = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     used, column = np.unique(column, return_inverse=True)
@@ -107,7 +107,7 @@ def _loops(surface: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
 
 def _rim_distance(
     template: SurfaceMesh, edges: np.ndarray, lattice: Lattice, feet_of: MeshFeet, nearest: np.ndarray,
-    rim: np.ndarray,
+    rims: cKDTree,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Signed distance to the rims along the mesh at the vertices of the template, which of these are near
     a rim, and which are cut as they lead from one layer to another."""
@@ -124,7 +124,7 @@ def _rim_distance(
     known = (candidates >= 0).any(axis=1)
     candidates = np.where(candidates >= 0, candidates, candidates.max(axis=1, keepdims=True))
     feet = feet_of(vertices[known].astype(float), candidates[known])
-    inner = cKDTree(rim).query(feet.point)[0]
+    inner = rims.query(feet.point)[0]
     on_mesh = (feet.distance < _ON_MESH_CELLS * h) & ((feet.normal * normals[known]).sum(axis=1) > _SAME_WAY)
     wanted = np.full(len(vertices), -2 * h)
     past = -np.maximum(feet.distance, h / 4)
