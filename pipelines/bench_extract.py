@@ -8,8 +8,9 @@ least time of each counts: processor time, which other programs disturb less tha
 cubes makes the closed template only, of float32 values in the same order; it has no derivatives.
 ``backward`` is the gradient of a smooth function of vertices and mSDF with respect to all fields. At the end,
 the same with fields stored in blocks around the surface (a narrow band): times, with the test whether the
-blocks still hold the surface, the exponents with which they grow, and peak memory: all that the process
-needs for fields, gradients, blocks and mesh.
+blocks still hold the surface, and the exponents with which they grow. Here the resolutions take turns, as
+in a fit, too, something else has been in the caches since the last extraction. Peak memory, of a process for
+each resolution, is all that it needs for fields, gradients, blocks and mesh.
 """
 
 import os
@@ -17,7 +18,6 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
-import json
 import re
 import subprocess
 import sys
@@ -37,6 +37,11 @@ from gshell_mi.lattice import GRIDS, make_lattice
 
 #: Bars: exponent of the times, and peak memory in MiB by resolution.
 EXPONENT, MEMORY = 2.2, {256: 512, 512: 2048}
+
+STEPS = ("forward", "forward + backward")
+
+#: Resolution at which the kernels of a band are compiled.
+_SMALL = 32
 
 
 def shirt(p: llvm.Array3f) -> tuple[llvm.Float, llvm.Float]:
@@ -98,8 +103,8 @@ def run(resolution: int, grids: list[str], repeats: int) -> dict[str, float]:
         seconds(scikit_image, best, "marching cubes")
         for grid in grids:
             for label, arrays in (("sdf, msdf", fields[grid][:2]), ("sdf, msdf, deform", fields[grid])):
-                for what, backward in (("forward", False), ("forward + backward", True)):
-                    action = partial(ours, grid, arrays, backward)
+                for what in STEPS:
+                    action = partial(ours, grid, arrays, what != STEPS[0])
                     seconds(action, best, f"{grid}: {label}: {what}")
     cubes = marching_cubes(volume, 0.0)[1]
     print(f"\n{resolution}^3 cells: marching cubes has {len(cubes)} triangles")
@@ -116,63 +121,69 @@ def memory(name: str) -> float:
     return int(re.search(rf"{name}:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) / 1024
 
 
-def run_banded(grid: str, resolution: int, repeats: int) -> dict[str, float]:
-    """Least seconds and peak memory in MiB of extractions in blocks, by name."""
-    best: dict[str, float] = {}
-    results: dict[str, float] = {}
+class Banded:
+    """Extractions in blocks at one resolution."""
 
-    def measure(resolution: int, repeats: int) -> None:
-        blocks = BlockLattice.around(make_lattice(grid, resolution), lambda p: shirt(p)[0], llvm.Float)
-        fields = shirt(blocks.points(llvm.Float))
-        dr.eval(fields)
+    def __init__(self, grid: str, resolution: int):
+        self.blocks = BlockLattice.around(make_lattice(grid, resolution), lambda p: shirt(p)[0], llvm.Float)
+        self.fields = shirt(self.blocks.points(llvm.Float))
+        dr.eval(self.fields)
         dr.sync_thread()
-        results["fraction"] = blocks.fraction
-        for what in ("forward", "forward + backward"):
 
-            def action(backward: bool = what != "forward") -> float:
-                dr.disable_grad(fields)
-                if backward:
-                    dr.enable_grad(fields)
-                start = time.process_time()
-                mesh = extract(blocks, *fields)
-                assert blocks.covers(mesh.cells)
-                if backward:
-                    dr.backward(dr.sum(dr.squared_norm(mesh.vertices)) + dr.sum(mesh.msdf))
-                    dr.eval([dr.grad(f) for f in fields])
-                dr.sync_thread()
-                return time.process_time() - start
+    def seconds(self, backward: bool) -> float:
+        dr.disable_grad(self.fields)
+        if backward:
+            dr.enable_grad(self.fields)
+        start = time.process_time()
+        mesh = extract(self.blocks, *self.fields)
+        assert self.blocks.covers(mesh.cells)
+        if backward:
+            dr.backward(dr.sum(dr.squared_norm(mesh.vertices)) + dr.sum(mesh.msdf))
+            dr.eval([dr.grad(f) for f in self.fields])
+        dr.sync_thread()
+        return time.process_time() - start
 
-            dr.flush_malloc_cache()
-            Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-            for _ in range(repeats):
-                seconds(action, best, what)
-            results[f"{what} MiB"] = memory("VmHWM") - before
 
-    before = 0.0
-    measure(32, 2)  # compiles
+def run_banded(grid: str, resolutions: list[int], repeats: int) -> None:
+    """Prints least times by resolution, and the exponents from the first to the last."""
+    bands = [Banded(grid, resolution) for resolution in resolutions]
+    best: list[dict[str, float]] = [{} for _ in bands]
+    for _ in range(repeats):
+        for what in STEPS:
+            for band, times in zip(bands, best, strict=True):
+                seconds(partial(band.seconds, what != STEPS[0]), times, what)
+    for resolution, band, times in zip(resolutions, bands, best, strict=True):
+        row = ", ".join(f"{name} {value * 1e3:.1f} ms" for name, value in times.items())
+        print(f"  {grid} {resolution}^3 in a band of {band.blocks.fraction:.3f} of the cells: {row}")
+    for what in STEPS:
+        exponent = np.log(best[-1][what] / best[0][what]) / np.log(resolutions[-1] / resolutions[0])
+        print(f"  {grid}: seconds of {what} grow with the exponent {exponent:.2f} "
+              f"{verdict(exponent, EXPONENT)}")
+
+
+def peak_of_band(grid: str, resolution: int) -> float:
+    """Peak memory in MiB of extractions in blocks, forward and backward, in a process of their own."""
+    for backward in (False, True):
+        Banded(grid, _SMALL).seconds(backward)  # compiles
     dr.flush_malloc_cache()
     before = memory("VmRSS")
-    best.clear()
-    measure(resolution, repeats)
-    return results | best
+    band = Banded(grid, resolution)
+    dr.flush_malloc_cache()
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+    for backward in (False, True):
+        band.seconds(backward)
+    return memory("VmHWM") - before
 
 
 def print_banded(grid: str, resolutions: list[int], repeats: int) -> None:
-    """One fresh process per resolution, as peak memory never falls."""
-    found = []
+    run_banded(grid, resolutions, repeats)
     for resolution in resolutions:
-        command = [sys.executable, __file__, "--banded", grid, str(resolution), str(repeats)]
+        # A fresh process, as peak memory never falls.
+        command = [sys.executable, __file__, "--peak-of-band", grid, str(resolution)]
         output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-        found.append(json.loads(output.splitlines()[-1]))
-        row = ", ".join(f"{name} {value:.4g}" for name, value in found[-1].items())
-        print(f"  {grid} {resolution}^3 in a band: {row}")
-        if resolution in MEMORY:
-            peak = found[-1]["forward + backward MiB"]
-            print(f"  {grid}: peak memory {peak:.0f} MiB {verdict(peak, MEMORY[resolution])}")
-    for what in ("forward", "forward + backward"):
-        exponent = np.log(found[-1][what] / found[0][what]) / np.log(resolutions[-1] / resolutions[0])
-        print(f"  {grid}: seconds of {what} grow with the exponent {exponent:.2f} "
-              f"{verdict(exponent, EXPONENT)}")
+        peak = float(output.splitlines()[-1])
+        bar = verdict(peak, MEMORY[resolution]) if resolution in MEMORY else ""
+        print(f"  {grid} {resolution}^3: peak memory {peak:.0f} MiB {bar}".rstrip())
 
 
 def verdict(value: float, bar: float) -> str:
@@ -187,12 +198,12 @@ def main() -> None:
     parser.add_argument("--grids", nargs="+", default=list(GRIDS), choices=GRIDS, help="kinds of lattices")
     parser.add_argument("--repeats", type=int, default=7, help="runs of which the fastest counts")
     parser.add_argument("--band", type=int, nargs="+", default=[128, 256, 512], help="the same with a band")
-    parser.add_argument("--banded", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--peak-of-band", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     dr.set_thread_count(1)  # the calling thread is that one: there are no workers
-    if arguments.banded:
-        grid, resolution, repeats = arguments.banded
-        print(json.dumps(run_banded(grid, int(resolution), int(repeats))))
+    if arguments.peak_of_band:
+        grid, resolution = arguments.peak_of_band
+        print(peak_of_band(grid, int(resolution)))
         return
     print(f"Dr.Jit {dr.__version__}, threads: {dr.thread_count()}")
     for resolution in arguments.resolutions:

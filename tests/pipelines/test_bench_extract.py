@@ -25,4 +25,7 @@ def test_prints_the_ratio_of_every_contestant():
     exponents = re.findall(r"with the exponent -?[\d.]+ \((?:at most|above) 2\.2\)$", output, re.MULTILINE)
     banded = [grid for grid in GRIDS if make_lattice(grid, 1).fits_in_blocks]
     assert len(exponents) == 2 * len(banded)
-    assert len(re.findall(r"\^3 in a band: fraction [\d.]+, forward MiB", output)) == 2 * len(banded)
+    row = r"\^3 in a band of [\d.]+ of the cells: forward [\d.]+ ms, forward \+ backward [\d.]+ ms$"
+    assert len(re.findall(row, output, re.MULTILINE)) == 2 * len(banded)
+    peaks = re.findall(r"\^3: peak memory (\d+) MiB$", output, re.MULTILINE)
+    assert len(peaks) == 2 * len(banded) and any(int(peak) > 0 for peak in peaks)
