@@ -78,6 +78,10 @@ class Lattice:
     closes_at_border: ClassVar[bool] = False
     """Whether the vertices on its border count as outside."""
 
+    joins_across_faces: ClassVar[bool] = False
+    """Whether the surface may pass between any two corners of a face of a cell, not only between those that
+    an edge of the lattice joins."""
+
     @property
     def weight_count(self) -> int:
         """Values of the field ``weights``, which only FlexiCubes have."""
@@ -211,6 +215,7 @@ class CubeLattice(Lattice):
     ``TetLattice``."""
 
     grid: ClassVar[str] = "cube"
+    joins_across_faces: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
@@ -222,6 +227,7 @@ class FlexiCubesLattice(Lattice):
 
     grid: ClassVar[str] = "flexicubes"
     closes_at_border: ClassVar[bool] = True
+    joins_across_faces: ClassVar[bool] = True
 
     @property
     def weight_count(self) -> int:

@@ -78,6 +78,23 @@ def vertex_components(edges: np.ndarray, vertex_count: int) -> tuple[int, np.nda
     return connected_components(graph, directed=False)
 
 
+def patch_sizes(patch: np.ndarray, whole: np.ndarray, counted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many of the (V,) ``counted`` vertices are in each vertex's patch, and in the largest patch beside it.
+
+    Args:
+        patch: (V,) ids of patches.
+        whole: (V,) ids of what falls into patches; those beside each other are in one.
+
+    >>> own, largest = patch_sizes(np.array([0, 0, 1, 2]), np.array([0, 0, 0, 1]), np.ones(4))
+    >>> own.tolist(), largest.tolist()
+    ([2.0, 2.0, 1.0, 1.0], [2.0, 2.0, 2.0, 1.0])
+    """
+    own = np.bincount(patch, counted)[patch]
+    largest = np.zeros(whole.max(initial=-1) + 1)
+    np.maximum.at(largest, whole, own)
+    return own, largest[whole]
+
+
 def equal_patches(labels: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V,) ids of the connected patches of vertices with equal (V,) labels, on a mesh with (F, 3) faces."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)

@@ -29,7 +29,7 @@ def separate_layers(sdf: np.ndarray, mesh: trimesh.Trimesh, lattice: Lattice, ba
     spacing = lattice.spacing
     flips = []
     pairs = [(0, corner) for corner in range(1, 8)]
-    if lattice.grid in ("cube", "flexicubes"):
+    if lattice.joins_across_faces:
         pairs += _OTHER_DIAGONALS
     start = mi.UInt32(inner.astype(np.uint32))
     for first, last in pairs:

@@ -44,7 +44,8 @@ def rim_cut(
     vertices, faces, _ = template.to_numpy()
     edges, _ = mesh_edges(faces)
     rims = cKDTree(rim)
-    wanted, beside_rim, cut = _rim_distance(template, edges, lattice, feet_of, nearest, rims)
+    normals = np.array(dr.detach(template.vertex_normals())).T
+    wanted, beside_rim, cut = _rim_distance(vertices, normals, faces, edges, lattice, feet_of, nearest, rims)
     entries = [tuple(np.array(x) for x in entry) for entry in dr.detach(template.stencil.entries())]
     row, column, weight = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     used, column = np.unique(column, return_inverse=True)
@@ -106,14 +107,12 @@ def _loops(surface: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rim_distance(
-    template: SurfaceMesh, edges: np.ndarray, lattice: Lattice, feet_of: MeshFeet, nearest: np.ndarray,
-    rims: cKDTree,
+    vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, edges: np.ndarray, lattice: Lattice,
+    feet_of: MeshFeet, nearest: np.ndarray, rims: cKDTree,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Signed distance to the rims along the mesh at the vertices of the template, which of these are near
     a rim, and which are cut as they lead from one layer to another."""
     h = lattice.spacing
-    vertices, faces, _ = template.to_numpy()
-    normals = np.array(dr.detach(template.vertex_normals())).T
     strides = np.array([1, lattice.stride, lattice.stride**2])
     cube = np.array(list(np.ndindex(2, 2, 2))) @ strides
     corners = []

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..topology import equal_patches, mesh_edges, vertex_components
+from ..topology import equal_patches, mesh_edges, patch_sizes, vertex_components
 
 #: Openings are parted where they are at most twice this many vertices wide.
 _NECK = 2
@@ -78,9 +78,8 @@ def open_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.
     solid = logits > 0
     patch = equal_patches(solid, faces)
     part = vertex_components(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(logits))[1]
-    size, largest = np.bincount(patch, solid), np.zeros(len(logits))
-    np.maximum.at(largest, part, size[patch])
-    island = solid & (size[patch] < largest[part])
+    size, largest = patch_sizes(patch, part, solid)
+    island = solid & (size < largest)
     if not island.any():
         return logits
     ratio = _ratios(error(solid), error(solid & ~island), patch).max(axis=0)

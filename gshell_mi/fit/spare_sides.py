@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.smoothing import MeshDiffusion
-from ..topology import Topology, mesh_edges, vertex_components
+from ..topology import Topology, mesh_edges, patch_sizes, vertex_components
 from .opening import also_opened
 from .template_sides import normals_at_vertices, opposite_sides
 
@@ -119,11 +119,9 @@ def _one_side(thin: np.ndarray, normals: np.ndarray, edges: np.ndarray, part: np
     start, end = edges.T
     flat = thin[start] & thin[end] & (np.einsum("nj,nj->n", normals[start], normals[end]) > _FLAT)
     patch = vertex_components(edges[flat], len(thin))[1]
-    size = np.bincount(patch, thin)
-    largest = np.zeros(len(thin))
-    np.maximum.at(largest, part, size[patch])
+    size, largest = patch_sizes(patch, part, thin)
     # Of patches of one size, the first.
-    chosen = np.flatnonzero(thin & (size[patch] == largest[part]))
+    chosen = np.flatnonzero(thin & (size == largest))
     first = patch[chosen[np.unique(part[chosen], return_index=True)[1]]]
     return thin & np.isin(patch, first)
 
@@ -148,9 +146,8 @@ def _cut_off(opened: np.ndarray, solid: np.ndarray, edges: np.ndarray) -> np.nda
     """(V,) small pieces of what was ``solid`` that hang in the opening now."""
     patch = vertex_components(edges[~opened[edges].any(axis=1)], len(solid))[1]
     whole = vertex_components(edges[solid[edges].all(axis=1)], len(solid))[1]
-    size, largest = np.bincount(patch, ~opened), np.zeros(len(solid))
-    np.maximum.at(largest, whole, size[patch])
-    return ~opened & (size[patch] < _CUT_OFF * largest[whole])
+    size, largest = patch_sizes(patch, whole, ~opened)
+    return ~opened & (size < _CUT_OFF * largest)
 
 
 def _balanced(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges: np.ndarray,
