@@ -79,7 +79,7 @@ def vertex_components(edges: np.ndarray, vertex_count: int) -> tuple[int, np.nda
 
 
 def patch_sizes(patch: np.ndarray, whole: np.ndarray, counted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How many of the (V,) ``counted`` vertices are in each vertex's patch, and in the largest patch beside it.
+    """How many of the (V,) ``counted`` vertices are in each vertex's patch, and in the largest beside it.
 
     Args:
         patch: (V,) ids of patches.
