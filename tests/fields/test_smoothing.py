@@ -8,6 +8,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
 from gshell_mi.block_lattice import BlockLattice
+from gshell_mi.fields import smoothing
 from gshell_mi.fields.smoothing import LatticeDiffusion
 from gshell_mi.lattice import TetLattice
 
@@ -102,7 +103,9 @@ def test_extend_keeps_constants():
     assert dr.count(known)[0] > 500
 
 
-def test_same_in_blocks_but_near_their_edge():
+@pytest.mark.parametrize("kept", [0, 1 << 22])
+def test_same_in_blocks_but_near_their_edge(kept: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(smoothing, "_NEIGHBOURS_KEPT", kept)
     lattice, reach = TetLattice(70), 4
     sdf = dr.norm(lattice.points(mi.Float)) - 0.5
     blocks = BlockLattice.around(lattice, sdf)
