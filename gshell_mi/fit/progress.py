@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -18,7 +18,7 @@ _WINDOW = 20
 class Progress:
     """Progress bars on stderr; silent if ``quiet``.
 
-    The time left is that of the running stage: the steps that remain times the mean of the last few.
+    The time left is that of the running stage: the steps that remain times what the last few took.
     """
 
     def __init__(self, *, quiet: bool = False):
@@ -56,8 +56,10 @@ class Progress:
             durations.append(now - last)
             last = now
             done += 1
-            mean = sum(durations) / len(durations)
-            detail = f"{done}/{total}  {mean:.2f} s/step  {_clock((total - done) * mean)} left"
+            detail = f"{done}/{total}"
+            if len(durations) > 1:
+                step = usual_duration(durations)
+                detail += f"  {step:.2f} s/step  {_clock((total - done) * step)} left"
             if values and "loss" in values:
                 quality = f"  PSNR {values['psnr']:.1f} dB" if "psnr" in values else ""
                 detail = f"loss {values['loss']:.4f}{quality}  {detail}"
@@ -76,6 +78,16 @@ class Progress:
         if self._reference is None:
             self._reference = self._bars.add_task("references", total=total, detail="")
         self._bars.update(self._reference, completed=done, total=total, detail=f"{done}/{total} rendered")
+
+
+def usual_duration(durations: Collection[float]) -> float:
+    """The mean of two or more durations without the longest, which may have compiled kernels: what a machine
+    does only once must not count for every step that remains.
+
+    >>> usual_duration([9.0, 0.5, 0.25])
+    0.375
+    """
+    return (sum(durations) - max(durations)) / (len(durations) - 1)
 
 
 def _clock(seconds: float) -> str:
