@@ -159,8 +159,8 @@ class FitConfig:
     max_depth: int = 3
     """Longest path: 2 is direct light, 3 adds one interreflection."""
     reparam_depth: int = 1
-    """Path segments whose visibility is differentiated: 1 is what the camera sees, 2 adds shadows. The hat
-    comes out the same with either (33.0 dB, 0.35 % chamfer), and 1 is faster."""
+    """Path segments whose visibility is differentiated: 1 is what the camera sees, 2 adds shadows. Shapes
+    come out the same with either, a dress with deep folds 0.2 dB better with 2, and 1 is faster."""
     geometry_lr: float = 0.05
     """Largest change of sdf and mSDF per step, in cells."""
     deform_lr: float = 0.02
