@@ -210,6 +210,13 @@ class BlockLattice:
         missing = (row == MISSING) | (within & up & ~exists)
         return dr.select(missing, MISSING, row << 5 | along)
 
+    def neighbours(self, vertex: Any) -> list[Any]:
+        """Ids of the nearest stored vertices, as of a lattice: the vertex itself where there is none."""
+        mask_t = dr.mask_t(self._uint_t)
+        found = (self.neighbour(vertex, self._uint_t(axis), mask_t(up))
+                 for axis in range(3) for up in (False, True))
+        return [dr.select(neighbour == MISSING, vertex, neighbour) for neighbour in found]
+
     def signs(self, sdf: Any) -> Any:
         """Per row, bit i: its vertex i is inside. Those at the edge are what they were."""
         return (pack_signs(sdf) & ~self.edge) | self.beyond

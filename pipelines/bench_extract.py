@@ -38,7 +38,8 @@ from gshell_mi.lattice import GRIDS, make_lattice
 #: Bars: exponent of the times, and peak memory in MiB by resolution.
 EXPONENT, MEMORY = 2.2, {256: 512, 512: 2048}
 
-STEPS = ("forward", "forward + backward")
+#: Whether what is timed has a backward pass, by its name.
+BACKWARD = {"forward": False, "forward + backward": True}
 
 #: Resolution at which the kernels of a band are compiled.
 _SMALL = 32
@@ -103,8 +104,8 @@ def run(resolution: int, grids: list[str], repeats: int) -> dict[str, float]:
         seconds(scikit_image, best, "marching cubes")
         for grid in grids:
             for label, arrays in (("sdf, msdf", fields[grid][:2]), ("sdf, msdf, deform", fields[grid])):
-                for what in STEPS:
-                    action = partial(ours, grid, arrays, what != STEPS[0])
+                for what, backward in BACKWARD.items():
+                    action = partial(ours, grid, arrays, backward)
                     seconds(action, best, f"{grid}: {label}: {what}")
     cubes = marching_cubes(volume, 0.0)[1]
     print(f"\n{resolution}^3 cells: marching cubes has {len(cubes)} triangles")
@@ -149,13 +150,13 @@ def run_banded(grid: str, resolutions: list[int], repeats: int) -> None:
     bands = [Banded(grid, resolution) for resolution in resolutions]
     best: list[dict[str, float]] = [{} for _ in bands]
     for _ in range(repeats):
-        for what in STEPS:
+        for what, backward in BACKWARD.items():
             for band, times in zip(bands, best, strict=True):
-                seconds(partial(band.seconds, what != STEPS[0]), times, what)
+                seconds(partial(band.seconds, backward), times, what)
     for resolution, band, times in zip(resolutions, bands, best, strict=True):
         row = ", ".join(f"{name} {value * 1e3:.1f} ms" for name, value in times.items())
         print(f"  {grid} {resolution}^3 in a band of {band.blocks.fraction:.3f} of the cells: {row}")
-    for what in STEPS:
+    for what in BACKWARD:
         exponent = np.log(best[-1][what] / best[0][what]) / np.log(resolutions[-1] / resolutions[0])
         print(f"  {grid}: seconds of {what} grow with the exponent {exponent:.2f} "
               f"{verdict(exponent, EXPONENT)}")
@@ -163,14 +164,14 @@ def run_banded(grid: str, resolutions: list[int], repeats: int) -> None:
 
 def peak_of_band(grid: str, resolution: int) -> float:
     """Peak memory in MiB of extractions in blocks, forward and backward, in a process of their own."""
-    for backward in (False, True):
+    for backward in BACKWARD.values():
         Banded(grid, _SMALL).seconds(backward)  # compiles
     dr.flush_malloc_cache()
     before = memory("VmRSS")
     band = Banded(grid, resolution)
     dr.flush_malloc_cache()
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-    for backward in (False, True):
+    for backward in BACKWARD.values():
         band.seconds(backward)
     return memory("VmHWM") - before
 

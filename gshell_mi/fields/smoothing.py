@@ -11,7 +11,6 @@ from scipy.sparse.csgraph import laplacian
 
 from ..block_lattice import BlockLattice
 from ..lattice import Lattice
-from ..sign_scan import MISSING
 from ..topology import mesh_edges
 
 #: Vertices of blocks, at most, whose neighbours are kept, in 24 bytes each: it takes half the time.
@@ -55,15 +54,8 @@ class LatticeDiffusion:
 
     def _around(self) -> list[mi.UInt32]:
         """The neighbours of each vertex; a missing one is the vertex itself."""
-        if self._neighbours:
-            return self._neighbours
-        vertex = dr.arange(mi.UInt32, self._count)
-        if not isinstance(self._lattice, BlockLattice):
-            return self._lattice.neighbours(vertex)
         # Of many blocks found anew each time: the tables of rows are small, all neighbours are not.
-        found = (self._lattice.neighbour(vertex, mi.UInt32(axis), mi.Bool(up))
-                 for axis in range(3) for up in (False, True))
-        return [dr.select(neighbour == MISSING, vertex, neighbour) for neighbour in found]
+        return self._neighbours or self._lattice.neighbours(dr.arange(mi.UInt32, self._count))
 
     def __call__(self, field: mi.Float, smoothing: float) -> mi.Float:
         """Diffuses a flat field of one value, or of interleaved channels, per lattice vertex.
