@@ -100,6 +100,38 @@ def sign_changes(inside: Any, lattice: Lattice) -> Any:
     return _set_bits(active & _bits_before(word, lattice.vertex_count))
 
 
+def vertices_near(cells: Any, lattice: Lattice, reach: int) -> Any:
+    """Ids of the vertices within ``reach`` along each axis of a cell's corners, and few others; ascending.
+
+    Args:
+        cells: the lowest vertices of the cells, of a whole lattice.
+        reach: in vertices of a cubic grid.
+    """
+    uint_t = type(cells)
+    if dr.width(cells) == 0:
+        return cells
+    strides = [1, lattice.stride, lattice.stride**2]
+    # The bits can only move down, so all begin at the top of what is near to them.
+    up = reach * sum(strides)
+    words = -(-(lattice.vertex_count + up) // 32)
+    near = dr.zeros(uint_t, words)
+    for corner in range(8):
+        vertex = lattice.corner(cells, uint_t(corner))
+        exists = vertex < dr.opaque(uint_t, lattice.vertex_count)
+        at = vertex + dr.opaque(uint_t, up)
+        dr.scatter_reduce(dr.ReduceOp.Or, near, uint_t(1) << (at & 31), at >> 5, exists)
+    word = dr.arange(uint_t, words)
+    for stride in strides:
+        covered, missing = 1, 2 * reach
+        while missing:
+            step = min(covered, missing)
+            offset = dr.opaque(uint_t, step * stride)
+            near |= _shifted(near, word, offset >> 5, offset & 31)
+            dr.eval(near)
+            covered, missing = covered + step, missing - step
+    return _set_bits(near & _bits_before(word, lattice.vertex_count))
+
+
 def _shifted(inside: Any, word: Any, words: Any, bits: Any) -> Any:
     """The signs that lie ``words`` and ``bits`` after those of each word; arbitrary where there are none."""
     last = dr.opaque(type(word), dr.width(inside) - 1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,12 +11,16 @@ from cholespy import CholeskySolverF, MatrixType
 from scipy.sparse import coo_matrix, eye
 from scipy.sparse.csgraph import laplacian
 
-from ..block_lattice import BlockLattice
-from ..lattice import Lattice
+from ..block_lattice import MARGIN, BlockLattice
+from ..lattice import MISSING, Lattice
+from ..sign_scan import vertices_near
 from ..topology import mesh_edges
 
 #: Vertices of blocks, at most, whose neighbours are kept, in 24 bytes each: it takes half the time.
 _NEIGHBOURS_KEPT = 1 << 22
+
+#: Cells between given cells and the edge of what is diffused around them, as around a surface in blocks.
+NEAR = MARGIN
 
 
 def falling(start: float, end: float, progress: float) -> float:
@@ -35,27 +41,41 @@ class LatticeDiffusion:
 
     Damped Jacobi iterations: they reach no farther than ``iterations`` cells, which is all that a
     preconditioner needs, and each is one small kernel. There is no flow through the boundary, so a
-    constant field stays as it is. The edge of the blocks of a ``BlockLattice`` is such a boundary: what would
-    have passed it stays inside.
+    constant field stays as it is. The edge of the blocks of a ``BlockLattice`` is such a boundary, and so is
+    that of the surroundings of given ``cells``: what would have passed it stays inside.
 
     Args:
         lattice: the fields have one value, or several channels, per vertex of it.
         iterations: Jacobi iterations.
+        cells: if given, ids of the lowest vertices of cells, as in ``SurfaceMesh.cells``: only the vertices
+            within ``NEAR`` cells of them are diffused, and all others keep their values. A gradient of a
+            surface is little else than 0 there. Blocks are such surroundings already and are diffused whole.
     """
 
-    def __init__(self, lattice: Lattice | BlockLattice, iterations: int = 12):
+    def __init__(self, lattice: Lattice | BlockLattice, iterations: int = 12, cells: mi.UInt32 | None = None):
         self.iterations = iterations
         self._lattice = lattice
         self._count = lattice.vertex_count
-        self._neighbours = None
-        if not isinstance(lattice, BlockLattice) or self._count <= _NEIGHBOURS_KEPT:
-            self._neighbours = self._around()
-            dr.eval(self._neighbours)
+        self._vertices = None
+        if cells is not None and isinstance(lattice, Lattice):
+            self._vertices = vertices_near(cells, lattice, NEAR)
 
-    def _around(self) -> list[mi.UInt32]:
-        """The neighbours of each vertex; a missing one is the vertex itself."""
-        # Of many blocks found anew each time: the tables of rows are small, all neighbours are not.
-        return self._neighbours or self._lattice.neighbours(dr.arange(mi.UInt32, self._count))
+    @cached_property
+    def _neighbours(self) -> list[mi.UInt32] | None:
+        """The neighbours of each vertex, if they are kept; a missing one is the vertex itself."""
+        if isinstance(self._lattice, BlockLattice) and self._count > _NEIGHBOURS_KEPT:
+            return None
+        if self._vertices is None:
+            found = self._lattice.neighbours(dr.arange(mi.UInt32, self._count))
+        else:
+            here = dr.arange(mi.UInt32, dr.width(self._vertices))
+            rank = dr.full(mi.UInt32, MISSING, self._count)
+            dr.scatter(rank, here, self._vertices, mode=dr.ReduceMode.Permute)
+            around = self._lattice.neighbours(self._vertices)
+            ranks = (dr.gather(mi.UInt32, rank, vertex) for vertex in around)
+            found = [dr.select(neighbour == MISSING, here, neighbour) for neighbour in ranks]
+        dr.eval(found)
+        return found
 
     def __call__(self, field: mi.Float, smoothing: float) -> mi.Float:
         """Diffuses a flat field of one value, or of interleaved channels, per lattice vertex.
@@ -68,10 +88,22 @@ class LatticeDiffusion:
             return field
         # Three channels at once take little more than half the time of one after the other.
         kind = mi.Vector3f if dr.width(field) == 3 * self._count else mi.Float
+        if self._vertices is None:
+            return self._diffused(kind, field, smoothing)
+        if dr.width(self._vertices) == 0:
+            return field
+        near = dr.ravel(dr.gather(kind, field, self._vertices))
+        diffused = mi.Float(field)
+        dr.scatter(diffused, dr.unravel(kind, self._diffused(kind, near, smoothing)), self._vertices,
+                   mode=dr.ReduceMode.Permute)
+        return diffused
+
+    def _diffused(self, kind: type, field: mi.Float, smoothing: float) -> mi.Float:
         known, weight = dr.unravel(kind, field), dr.opaque(mi.Float, smoothing)
         solution = field
         for _ in range(self.iterations):
-            neighbours = self._around()
+            # Of many blocks found anew each time: the tables of rows are small, all neighbours are not.
+            neighbours = self._neighbours or self._lattice.neighbours(dr.arange(mi.UInt32, self._count))
             total = sum(dr.gather(kind, solution, neighbour) for neighbour in neighbours)
             solution = dr.ravel((known + weight * total) / (1 + len(neighbours) * weight))
             dr.eval(solution)

@@ -55,7 +55,6 @@ class JointStage:
             self.subject.shade_flat()
         self._integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
                                          "reparam_depth": config.reparam_depth, "hide_emitters": True})
-        self._diffuse = LatticeDiffusion(self.subject.lattice)
         resting = {"msdf"} if config.watertight else set()
         if not config.flexicubes_weights:
             resting.add("weights")
@@ -106,10 +105,11 @@ class JointStage:
             compute(*(dr.grad(value) for value in (*self.fields.values(), *self.shading.values())))
         progress = iteration / max(config.iterations, 1)
         with phase("optimiser"):
+            diffuse = LatticeDiffusion(self.subject.lattice, cells=self.subject.surface.cells)
             if moving:
                 gradients = {name: dr.grad(field) for name, field in self.fields.items()}
-                self.geometry.step(gradients, progress, iteration)
-            self._step_shading(0.1**progress)
+                self.geometry.step(gradients, progress, iteration, diffuse)
+            self._step_shading(0.1**progress, diffuse)
         self._follow_surface(rescan=(iteration + 1) % _RESCAN == 0)
         error = dr.mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]), axis=None)
         return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
@@ -173,15 +173,14 @@ class JointStage:
         self.geometry.carry(carried)
         carried.optimizer(self.shading, self.material.on_lattice)
         self.material.carry(carried)
-        self._diffuse = LatticeDiffusion(carried.after)
 
-    def _step_shading(self, decay: float) -> None:
+    def _step_shading(self, decay: float, diffuse: LatticeDiffusion) -> None:
         config, optimizer = self.config, self.shading
         if not optimizer.state:
             return
         for name in self.material.on_lattice:
             gradient = dr.grad(optimizer[name])
-            dr.set_grad(optimizer[name], self._diffuse(gradient, config.material_gradient_smoothing))
+            dr.set_grad(optimizer[name], diffuse(gradient, config.material_gradient_smoothing))
         rates = dict.fromkeys(self.material.parameters, decay * config.material_lr)
         if self.light:
             rates["light"] = decay * config.light_lr

@@ -27,7 +27,6 @@ class ExplicitGrid(Parametrisation):
 
     def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules):
         self.lattice, self.rules = lattice, rules
-        self._diffuse = LatticeDiffusion(lattice)
         self.optimizer = mi.ad.Adam(lr=rules.rate, uniform=True)
         for name, field in start.items():
             self.optimizer[name] = mi.Float(field)
@@ -41,18 +40,20 @@ class ExplicitGrid(Parametrisation):
 
     def carry(self, carried: Carried) -> None:
         carried.optimizer(self.optimizer, tuple(self.optimizer.keys()))
-        self.lattice, self._diffuse = carried.after, LatticeDiffusion(carried.after)
+        self.lattice = carried.after
 
-    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0) -> None:
+    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
+             diffuse: LatticeDiffusion | None = None) -> None:
         rules, optimizer = self.rules, self.optimizer
         decay = rules.decay(progress)
         smoothing = rules.smoothing_at(progress)
+        diffuse = diffuse or LatticeDiffusion(self.lattice)
         far, local = decay * rules.rate * self.lattice.spacing, decay * rules.deform_rate
         rates = {"sdf": far, "msdf": far, "deform": local, "weights": local}
         for name, gradient in gradients.items():
             gradient = finite(gradient)
             if name in CHANNELS:
-                gradient = self._diffuse(gradient, smoothing)
+                gradient = diffuse(gradient, smoothing)
             dr.set_grad(optimizer[name], gradient)
         optimizer.set_learning_rate({name: rates[name] for name in gradients})
         optimizer.step()

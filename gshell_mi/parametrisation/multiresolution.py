@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
+from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
 from .explicit import ExplicitGrid
 from .parametrisation import CHANNELS, Parametrisation, StepRules, finite, taken, touched
@@ -58,7 +59,8 @@ class MultiresolutionGrid(Parametrisation):
         if self._cubes:
             self._cubes.carry(carried)
 
-    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0) -> None:
+    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
+             diffuse: LatticeDiffusion | None = None) -> None:
         rules, optimizer = self.rules, self.optimizer
         own = {name: finite(gradients[name]) for name in self._names}
         vertex = touched(own, self.lattice.vertex_count)

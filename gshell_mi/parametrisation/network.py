@@ -12,6 +12,7 @@ from drjit import nn
 
 from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
+from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
 from .explicit import ExplicitGrid
 from .parametrisation import CHANNELS, Parametrisation, StepRules, finite, taken, touched
@@ -142,7 +143,8 @@ class NetworkFields(Parametrisation):
 
     # --- steps
 
-    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0) -> None:
+    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
+             diffuse: LatticeDiffusion | None = None) -> None:
         own = {name: finite(gradients[name]) for name in self._start}
         vertex = touched(own, self.lattice.vertex_count)
         if dr.width(vertex):

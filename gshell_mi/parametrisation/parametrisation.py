@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ..extraction.surface_mesh import gather
 from ..fields.carried import Carried
-from ..fields.smoothing import falling
+from ..fields.smoothing import LatticeDiffusion, falling
 
 #: Values per lattice vertex of the fields that live there; the weights of FlexiCubes belong to cubes.
 CHANNELS = {"sdf": 1, "msdf": 1, "deform": 3}
@@ -62,13 +62,16 @@ class Parametrisation(ABC):
         """The present fields, detached."""
 
     @abstractmethod
-    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0) -> None:
+    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
+             diffuse: LatticeDiffusion | None = None) -> None:
         """Moves the parameters.
 
         Args:
             gradients: of the loss with respect to each of the ``fields()``.
             progress: in [0, 1], of the whole fit.
             iteration: seeds what a step draws at random.
+            diffuse: smooths the gradients of lattice values, where such are the parameters; by default on the
+                whole lattice.
         """
 
     @abstractmethod

@@ -5,12 +5,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from scipy.ndimage import binary_dilation
 from scipy.sparse.linalg import spsolve
 
 from gshell_mi.block_lattice import BlockLattice
 from gshell_mi.fields import smoothing
 from gshell_mi.fields.smoothing import LatticeDiffusion
-from gshell_mi.lattice import TetLattice
+from gshell_mi.lattice import Lattice, TetLattice, make_lattice
+from gshell_mi.sign_scan import active_cells, vertices_near
 
 N = 9
 LATTICE = TetLattice(N - 1)
@@ -123,3 +125,64 @@ def test_constants_stay_in_blocks():
     blocks = BlockLattice.around(lattice, lattice.points(mi.Float).x - 0.3)
     result = LatticeDiffusion(blocks)(dr.full(mi.Float, 2.5, blocks.vertex_count), 8.0)
     np.testing.assert_allclose(result.numpy(), 2.5, rtol=1e-5)
+
+
+def surface_cells(lattice: Lattice) -> mi.UInt32:
+    """Of an oblique sheet that runs out of the lattice, with a ball beside it that touches two borders."""
+    p = lattice.points(mi.Float)
+    ball = dr.norm(p - mi.Point3f(0.8, 0.1, -0.8)) - 0.3
+    return active_cells(dr.minimum(0.6 * p.x + 0.3 * p.y - 0.7 * p.z + 0.4, ball), lattice)[0]
+
+
+@pytest.mark.parametrize("lattice", [make_lattice(grid, n) for grid, n in
+                                     (("tet", 13), ("cube", 31), ("flexicubes", 10), ("bcc", 12))],
+                         ids=lambda lattice: lattice.grid)
+@pytest.mark.parametrize("reach", [1, 3, 5])
+def test_vertices_near_cells(lattice: Lattice, reach: int):
+    """All that are in reach, and nearly none that is a good deal farther."""
+    cells = surface_cells(lattice)
+    corners = np.concatenate([lattice.corner(cells, mi.UInt32(corner)).numpy() for corner in range(8)])
+    exists = np.zeros((len(lattice.grids), *3 * (lattice.stride,)), bool)
+    # The corners of cells that the lattice ends in are not looked at: they have been wrapped around.
+    exists.ravel()[corners[corners < lattice.vertex_count]] = True
+    exact = np.stack([binary_dilation(grid, np.ones(3 * (2 * reach + 1,))) for grid in exists]).ravel()
+    found = vertices_near(cells, lattice, reach).numpy()
+    assert (np.diff(found) > 0).all()
+    near = np.zeros(lattice.vertex_count, bool)
+    near[found] = True
+    assert near[exact].all()
+    assert near.sum() < exact.sum() + 0.2 * lattice.vertex_count
+
+
+def test_no_cell_is_near_nothing(field):
+    lattice = TetLattice(N - 1)
+    assert dr.width(vertices_near(mi.UInt32(), lattice, 3)) == 0
+    np.testing.assert_array_equal(LatticeDiffusion(lattice, cells=mi.UInt32())(mi.Float(field), 8.0), field)
+
+
+def test_near_cells_the_others_keep_their_values():
+    lattice = TetLattice(40)
+    cells = surface_cells(lattice)
+    near = np.zeros(lattice.vertex_count, bool)
+    near[vertices_near(cells, lattice, smoothing.NEAR).numpy()] = True
+    assert 0.2 < near.mean() < 0.8
+    field = np.random.default_rng(3).normal(size=(lattice.vertex_count, 3)).astype(np.float32)
+    diffuse = LatticeDiffusion(lattice, cells=cells)
+    result = diffuse(mi.Float(field.ravel()), 8.0).numpy().reshape(-1, 3)
+    np.testing.assert_array_equal(result[~near], field[~near])
+    np.testing.assert_allclose(result[near].sum(axis=0, dtype=np.float64), field[near].sum(axis=0), atol=1e-2)
+    for channel in range(3):
+        single = diffuse(mi.Float(np.ascontiguousarray(field[:, channel])), 8.0).numpy()
+        np.testing.assert_allclose(result[:, channel], single, atol=1e-6)
+
+
+def test_near_cells_it_is_the_same_but_near_the_edge():
+    lattice, iterations = TetLattice(40), 2
+    cells = surface_cells(lattice)
+    field = mi.Float(np.random.default_rng(0).normal(size=lattice.vertex_count).astype(np.float32))
+    whole = LatticeDiffusion(lattice, iterations)(field, 8.0).numpy()
+    limited = LatticeDiffusion(lattice, iterations, cells)(field, 8.0).numpy()
+    # What is as far from the edge as the iterations reach has felt nothing of it.
+    inner = vertices_near(cells, lattice, smoothing.NEAR - iterations).numpy()
+    assert len(inner) > 1000
+    np.testing.assert_array_equal(limited[inner], whole[inner])
