@@ -23,3 +23,31 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def unit(vectors: np.ndarray) -> np.ndarray:
     """(..., 3) vectors at length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+
+
+def positive_part(vertices: np.ndarray, faces: np.ndarray,
+                  values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The part of a mesh in which (V,) values, linear on every face, are positive: (n, 3) vertices and (m, 3)
+    faces. The old vertices come first, in use or not.
+
+    >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> points, part = positive_part(corners, np.array([[0, 1, 2]]), np.array([1.0, -1.0, -3.0]))
+    >>> points[3:].tolist(), part.tolist()
+    ([[0.5, 0.0, 0.0], [0.0, 0.25, 0.0]], [[0, 3, 4]])
+    """
+    positive = values > 0
+    number = positive[faces].sum(axis=1)
+    whole, mixed = faces[number == 3], faces[(number == 1) | (number == 2)]
+    # Turned so that the first corner is alone on its side.
+    lone = (positive[mixed] == (number[(number == 1) | (number == 2)] == 1)[:, None]).argmax(axis=1)
+    a, b, c = np.take_along_axis(mixed, (lone[:, None] + np.arange(3)) % 3, axis=1).T
+    ends = np.sort(np.stack([np.concatenate([a, a]), np.concatenate([b, c])], axis=1), axis=1)
+    edges, index = np.unique(ends, axis=0, return_inverse=True)
+    ab, ac = len(vertices) + index.reshape(2, -1)
+    low, high = values[edges].T
+    share = (low / np.where(low == high, 1, low - high))[:, None]
+    points = (1 - share) * vertices[edges[:, 0]] + share * vertices[edges[:, 1]]
+    stays = positive[a]
+    parts = [whole, np.stack([a, ab, ac], axis=1)[stays], np.stack([ab, b, c], axis=1)[~stays],
+             np.stack([ab, c, ac], axis=1)[~stays]]
+    return np.concatenate([vertices, points]), np.concatenate(parts)

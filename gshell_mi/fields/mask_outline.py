@@ -12,7 +12,7 @@ _CONTOUR_SAMPLES = 4
 #: Pixels nearer to the outline than this get their distance from the sub-pixel contour.
 _NEAR = 6.0
 #: Less coverage is taken for noise; beside a sharp edge there is more than the latter.
-_FAINT, _FULL = 0.05, 0.75
+_FAINT, _FULL = 0.01, 0.75
 #: Masks are sharp if a tenth of their edges rises by this much from one pixel to the next.
 _STEEP = 0.45
 

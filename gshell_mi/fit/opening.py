@@ -9,7 +9,7 @@ import numpy as np
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields.smoothing import LatticeDiffusion, MeshDiffusion
 from ..lattice import Lattice
-from ..topology import equal_patches
+from ..topology import equal_patches, mesh_edges, vertex_components
 from ..triangles import face_areas
 
 #: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
@@ -17,6 +17,9 @@ _CERTAIN = 3.0
 
 #: What a speck leaves at its neighbours when it goes may be the next one.
 _CLEANINGS = 4
+
+#: Share of a piece of the template that is more than a speck on it: about one of its two sides.
+_SIDE = 0.25
 
 #: Share of newly open vertices around a vertex from which on its value is new.
 _NEAR = 0.01
@@ -28,7 +31,8 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
     Args:
         logits: (V,) opacity logits; surface where positive.
         vertices, faces: the template.
-        min_area: connected patches of one sign smaller than this fraction of the template's area flip.
+        min_area: connected patches of one sign smaller than this fraction of the template's area flip. A side
+            of a piece that is apart from the rest counts as the whole piece.
 
     Returns:
         (V,) logits, those of flipped patches negated.
@@ -37,11 +41,15 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
     for corner in range(3):
         np.add.at(area, faces[:, corner], face_areas(vertices, faces) / 3)
     cleaned = logits.copy()
+    piece = vertex_components(mesh_edges(faces)[0], len(vertices))[1]
+    piece_area = np.bincount(piece, area)[piece]
     # Cuts first: an island in a cut that closes is none.
     for flip_closed in (False, True):
         solid = cleaned > 0
         patch = equal_patches(solid, faces)
-        small = np.bincount(patch, area)[patch] < min_area * area.sum()
+        patch_area = np.bincount(patch, area)[patch]
+        patch_area = np.where(patch_area > _SIDE * piece_area, piece_area, patch_area)
+        small = patch_area < min_area * area.sum()
         flip = small & (solid == flip_closed)
         cleaned[flip] = -cleaned[flip]
     return cleaned

@@ -53,7 +53,8 @@ _FRACTIONS = (1.0, 0.7, 0.4)
 
 
 def recast(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, logits: np.ndarray,
-           radiance: np.ndarray, min_area: float, wanted: Topology) -> dict[str, np.ndarray] | None:
+           radiance: np.ndarray, min_area: float, wanted: Topology,
+           fewest_loops: int | None = None) -> dict[str, np.ndarray] | None:
     """Fields whose surface is the moved template's, with its openings.
 
     Args:
@@ -64,12 +65,14 @@ def recast(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: np
         radiance: (V, 3).
         min_area: smaller cuts and islands, as a fraction of the template's area, are undone.
         wanted: what the surface is to be like.
+        fewest_loops: so few boundary loops will do; by default as many as are wanted.
 
     Returns:
         ``sdf``, ``msdf``, ``radiance`` (n, 3) and ``known`` (n,) on the lattice; None if the surface
         comes out with other boundary loops, more components or many more pin-holes, however little it moves.
     """
-    nearly = None
+    nearly, most_loops = None, wanted.boundary_loops
+    fewest_loops = most_loops if fewest_loops is None else fewest_loops
     for fraction in _FRACTIONS:
         fields = _fields(subject, vertices, vertices + fraction * (moved - vertices), faces, logits, radiance,
                          min_area)
@@ -79,7 +82,7 @@ def recast(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: np
         subject.set_fields(dataclasses.replace(closed, msdf=fields["msdf"]))
         surface_vertices, surface_faces, _ = subject.surface.to_numpy()
         found = topology(surface_vertices, surface_faces)
-        if found.boundary_loops == wanted.boundary_loops and found.components <= wanted.components:
+        if fewest_loops <= found.boundary_loops <= most_loops and found.components <= wanted.components:
             if found.pinholes <= wanted.pinholes:
                 return fields
             if nearly is None and found.pinholes <= wanted.pinholes + _PINHOLES:

@@ -25,6 +25,7 @@ from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
 from ..scene import load_fit_scene
 from ..topology import topology
+from ..triangles import positive_part
 from ..views import PinholeViews
 from .bookkeeping import Bookkeeping, checkpoint_path
 from .carving import carve
@@ -302,7 +303,7 @@ class _Fit:
             return None
         for cut in self._cuts(template, moved.positions):
             fields = recast(self.scene.subject, template.vertices, cut.positions, template.faces, cut.logits,
-                            moved.radiance, self.config.ghost_min_area, cut.topology)
+                            moved.radiance, self.config.ghost_min_area, cut.topology, cut.fewest_loops)
             if fields:
                 return fields
         return None
@@ -318,12 +319,12 @@ class _Fit:
 
     def _cuts(self, template: GhostTemplate, moved: np.ndarray) -> list[Cut]:
         """How to cut a moved template, the best first."""
-        found = topology(template.vertices, template.faces[template.solid[template.faces].all(axis=1)])
-        as_found = Cut(template.logits, moved, found)
+        found = topology(*positive_part(template.vertices, template.faces, template.logits))
+        as_found = Cut(template.logits, moved, found, found.boundary_loops)
         if self.config.watertight or not self.config.sheet_thickness:
             return [as_found]
         cut = without_spare_sides(as_found, template.vertices, template.faces, self.scene.subject.cell_size,
-                                  self.config.sheet_thickness)
+                                  self.config.sheet_thickness, self.config.ghost_min_area)
         return [cut, as_found] if cut else [as_found]
 
     def _split_pixels(self) -> tuple[PixelPool, PixelPool]:

@@ -8,15 +8,15 @@ side that stays can be where the sheet is.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 
 from ..fields.smoothing import MeshDiffusion
-from ..topology import Topology, mesh_edges, patch_sizes, vertex_components
-from .opening import also_opened
+from ..topology import Topology, mesh_edges, patch_sizes, topology, vertex_components
+from ..triangles import positive_part
+from .opening import also_opened, clean_opacity
 from .template_sides import normals_at_vertices, opposite_sides
 
 #: Parts are thin up to this thickness, in cells.
@@ -24,6 +24,9 @@ _THIN = 1.2
 
 #: Least cosine with which sides of a sheet face away from each other, and neighbours on a side the same way.
 _FLAT = 0.8
+
+#: Openings smaller than this fraction of the largest grow last, all at once.
+_SMALL = 0.05
 
 #: What is cut off and smaller than this fraction of what it was part of goes.
 _CUT_OFF = 0.1
@@ -33,6 +36,9 @@ _SHEET_SHARE = 0.35
 
 #: Lambda that smooths the new rims along the mesh, and how spare sides are carried along.
 _SMOOTHING = 3.0
+
+#: Size, at least, of the logits of both sides where one stays.
+_LEAST = 0.2
 
 #: A ridge is up to twice this many vertices wide.
 _RIDGE = 3
@@ -49,16 +55,20 @@ class Cut:
         logits: (V,) surface where positive, open elsewhere.
         positions: (V, 3) of the vertices, world units.
         topology: of what stays.
+        fewest_loops: boundary loops of what stays if those close that a hole through a sheet, a tunnel before
+            one side went, has got. The hull of a thin sheet may have more holes than the sheet.
     """
 
     logits: np.ndarray
     positions: np.ndarray
     topology: Topology
+    fewest_loops: int
 
 
 def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: float,
-                        sheet_thickness: float) -> Cut | None:
-    """A moved template without the sides that it can do without; None if there are none.
+                        sheet_thickness: float, min_area: float) -> Cut | None:
+    """A moved template without the sides that it can do without; None if there are none, or it would fall
+    apart.
 
     Args:
         cut: the template with them.
@@ -66,6 +76,7 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
         faces: (F, 3) of the watertight template, oriented outwards.
         cell: side of a lattice cell, in the positions' unit.
         sheet_thickness: median thickness, in cells, up to which a part without an opening is a sheet.
+        min_area: smaller cuts and islands, as a fraction of the template's area, are undone.
     """
     solid = cut.logits > 0
     thickness, opposite = opposite_sides(before, cut.positions, faces, cell)
@@ -74,10 +85,17 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
     if not spare.any():
         return None
     logits, _ = also_opened(cut.logits, spare, smooth)
+    logits[spare] = np.minimum(logits[spare], -_LEAST)
+    stays = solid & ~spare & np.isfinite(thickness) & (spare | ~solid)[opposite]
+    logits[stays] = np.maximum(logits[stays], _LEAST)
+    logits = clean_opacity(logits, before, faces, min_area)
+    left = topology(*positive_part(before, faces, logits))
+    if left.components > cut.topology.components:
+        return None
     thickness, opposite = opposite_sides(before, before, faces, cell)
     opposite = np.where(np.isfinite(thickness), opposite, -1)
-    return Cut(logits, carried(before, cut.positions, spare, opposite, smooth),
-               dataclasses.replace(cut.topology, boundary_loops=cut.topology.boundary_loops + sheets))
+    return Cut(logits, carried(before, cut.positions, spare, opposite, smooth), left,
+               min(cut.fewest_loops + sheets, left.boundary_loops))
 
 
 def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray, faces: np.ndarray,
@@ -106,7 +124,9 @@ def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray
     candidates = np.flatnonzero(thin & closed)
     opened = _grown(~solid | closed & _one_side(thin, normals, edges, part), thin, opposite, edges)
     opened |= _cut_off(opened, solid, edges)
-    spare = solid & (_balanced(opened, thin, opposite, edges, smooth) < 0)
+    # Where a sheet is narrow its rims are near, and smoothing them must not change what stays between them.
+    decided = np.isfinite(thickness) & (opened | opened[opposite])
+    spare = solid & np.where(decided, opened, _balanced(opened, thin, opposite, edges, smooth) < 0)
     # A fin of something solid is no sheet, nor is a plate, whose sides stay apart.
     share = np.bincount(part, spare) / np.maximum(np.bincount(part, solid), 1)
     sheets = [index for index in np.unique(part[candidates]) if share[index] > _SHEET_SHARE
@@ -127,17 +147,25 @@ def _one_side(thin: np.ndarray, normals: np.ndarray, edges: np.ndarray, part: np
 
 
 def _grown(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """(V,) openings grown over thin parts, as far as the other side stays, and over the ridges beyond."""
+    """(V,) openings grown over thin parts, as far as the other side stays, and over the ridges beyond.
+
+    One opening after the other grows, the largest first: small ones, such as along the rim of a hole, would
+    take the side that stays away from it.
+    """
+    patch = vertex_components(edges[opened[edges].all(axis=1)], len(opened))[1]
+    sizes = np.bincount(patch, opened)
     needed, start = np.zeros(len(opened), bool), opened
     needed[opposite[opened & thin]] = True
-    while True:
-        front = _beside(opened, edges) & thin & ~opened[opposite] & ~needed
-        # Of two sides that are reached at once one stays.
-        front &= ~(front[opposite] & (opposite < np.arange(len(opened))))
-        if not front.any():
-            break
-        opened = opened | front
-        needed[opposite[front]] = True
+    sources = [patch == index for index in np.argsort(-sizes) if sizes[index] > _SMALL * sizes.max()]
+    for source in (*sources, opened):
+        while True:
+            front = _beside(source, edges) & thin & ~opened & ~opened[opposite] & ~needed
+            # Of two sides that are reached at once one stays.
+            front &= ~(front[opposite] & (opposite < np.arange(len(opened))))
+            if not front.any():
+                break
+            source, opened = source | front, opened | front
+            needed[opposite[front]] = True
     # Where a sheet ends its sides meet in a ridge, which has no other side.
     return opened | _beside(opened & ~start, edges) & ~needed & ~(thin & opened[opposite])
 

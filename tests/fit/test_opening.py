@@ -39,6 +39,19 @@ def test_an_island_in_a_small_cut_is_just_surface(ball):
     assert (clean_opacity(logits, ball.vertices, ball.faces, min_area=0.02) > 0).all()
 
 
+def test_a_side_of_a_small_piece_is_no_speck(ball):
+    """A ball beside the large one, with 3 % of the area, of which one half is open; one with 0.3 % goes."""
+    pieces = [(1.0, [0, 0, 0]), (0.175, [2, 0, 0]), (0.055, [0, 2, 0])]
+    vertices = np.concatenate([scale * ball.vertices + offset for scale, offset in pieces])
+    count = len(ball.vertices)
+    faces = np.concatenate([ball.faces + piece * count for piece in range(len(pieces))])
+    logits = np.ones(len(vertices))
+    logits[count:][cap(ball, [0, 0, 1], 0.6)[np.arange(2 * count) % count]] = -1
+    cleaned = clean_opacity(logits, vertices, faces, min_area=0.02)
+    np.testing.assert_array_equal(cleaned[:2 * count], logits[:2 * count])
+    assert (cleaned[2 * count:] < 0).all()
+
+
 @pytest.mark.parametrize("height", [-0.21, 0.0, 0.337])
 def test_the_rim_lies_where_the_logits_change_sign(height):
     lattice = TetLattice(24)

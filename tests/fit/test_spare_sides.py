@@ -10,6 +10,7 @@ from gshell_mi.fit.recast import recast
 from gshell_mi.fit.spare_sides import Cut, without_spare_sides
 from gshell_mi.fit.template_sides import opposite_sides
 from gshell_mi.topology import topology
+from gshell_mi.triangles import positive_part
 
 RESOLUTION = 32
 CELL = 2 / RESOLUTION
@@ -42,7 +43,8 @@ def flattened(vertices: np.ndarray, thickness: float) -> np.ndarray:
 
 def cut(vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> Cut | None:
     found = topology(vertices, faces[solid[faces].all(axis=1)])
-    return without_spare_sides(Cut(np.where(solid, 3.0, -3.0), moved, found), vertices, faces, CELL, 0.5)
+    return without_spare_sides(Cut(np.where(solid, 3.0, -3.0), moved, found, found.boundary_loops), vertices,
+                               faces, CELL, 0.5, 0.005)
 
 
 @pytest.mark.parametrize("thickness", [0.2, -0.2])
@@ -58,7 +60,7 @@ def test_of_a_sheet_one_side_is_left(thickness):
 
     subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
     fields = recast(subject, vertices, found.positions, faces, found.logits, np.ones((len(vertices), 3)),
-                    0.005, found.topology)
+                    0.005, found.topology, found.fewest_loops)
     closed = LatticeFields.closed(fields["sdf"])
     subject.set_fields(LatticeFields(closed.sdf, fields["msdf"], closed.deform))
     surface, surface_faces, _ = subject.surface.to_numpy()
@@ -105,3 +107,30 @@ def test_spare_sides_follow_those_that_stay():
     thickness, _ = opposite_sides(found.positions, found.positions, faces, CELL)
     within = np.hypot(vertices[:, 0], vertices[:, 1]) < RADIUS - 2 * CELL
     np.testing.assert_allclose(thickness[within], 1.6 * CELL, atol=0.5 * CELL)
+
+
+def test_holes_through_a_sheet_keep_narrow_bridges_between_them():
+    """A plate with two holes, three cells apart: with one side gone it has three rims, and is whole."""
+    points = TetLattice(RESOLUTION).vertex_positions()
+    radius = np.hypot(points[:, 0], points[:, 1])
+    holes = [np.hypot(points[:, 0] - side, points[:, 1]) - 0.2 for side in (-0.29, 0.29)]
+    solid = np.maximum(np.abs(points[:, 2] - HEIGHT) - 0.8 * CELL, radius - RADIUS)
+    vertices, faces = template(np.maximum(solid, -np.minimum(*holes)))
+    found = cut(vertices, flattened(vertices, 0.2), faces, np.full(len(vertices), True))
+    assert (found.topology.boundary_loops, found.topology.components) == (3, 1)
+    assert found.fewest_loops == 1
+    left, left_faces = positive_part(vertices, faces, found.logits)
+    between = (np.abs(left[:, 0]) < 0.5 * CELL) & (np.abs(left[:, 1]) < 0.5 * CELL)
+    assert np.isin(np.flatnonzero(between), left_faces).any(), "the bridge is there"
+
+
+def test_the_largest_opening_grows_first():
+    """A small opening in the other side takes nothing of it, though it reaches it at once."""
+    vertices, faces = plate()
+    radius, upper = np.hypot(vertices[:, 0], vertices[:, 1]), vertices[:, 2] > HEIGHT
+    from_small = np.hypot(vertices[:, 0] - 0.35, vertices[:, 1])
+    solid = np.where(upper, from_small > 2 * CELL, np.hypot(vertices[:, 0] + 0.2, vertices[:, 1]) > 0.3)
+    found = cut(vertices, flattened(vertices, 0.2), faces, solid)
+    opened = found.logits < 0
+    within = (radius < RADIUS - 2 * CELL) & (from_small > 4 * CELL)
+    assert opened[within & ~upper].all() and not opened[within & upper].any()
