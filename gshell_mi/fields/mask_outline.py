@@ -13,6 +13,8 @@ _CONTOUR_SAMPLES = 4
 _NEAR = 6.0
 #: Less coverage is taken for noise; beside a sharp edge there is more than the latter.
 _FAINT, _FULL = 0.01, 0.75
+#: Where more of the pixels around are faint, that is haze and no part of the object.
+_HAZE = 0.7
 #: Masks are sharp if a tenth of their edges rises by this much from one pixel to the next.
 _STEEP = 0.45
 
@@ -71,4 +73,5 @@ def _with_thin_parts(alpha: np.ndarray) -> np.ndarray:
     """The coverage, scaled up where none nearby is nearly full, to where the greatest is."""
     greatest = ndimage.maximum_filter(alpha, 3)
     thin = (alpha > _FAINT) & (greatest < _FULL)
+    thin &= ndimage.uniform_filter(thin.astype(np.float32), 5) < _HAZE
     return np.where(thin, alpha / np.where(thin, greatest, 1), alpha)

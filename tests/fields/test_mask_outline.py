@@ -31,7 +31,7 @@ def test_holes_are_filled_on_request():
     assert mask_distance(alpha)[16, 16] < 0 < mask_distance(alpha, fill_holes=False)[16, 16]
 
 
-@pytest.mark.parametrize("shares", [(0.3,), (0.15, 0.2), (0.05, 0.3, 0.05)])
+@pytest.mark.parametrize("shares", [(0.3,), (0.15, 0.2), (0.05, 0.3, 0.05), (0.02,)])
 def test_a_sheet_seen_edge_on_counts_as_a_pixel_wide(shares):
     alpha = np.zeros((32, 32))
     alpha[4:28, 16:16 + len(shares)] = shares
@@ -42,8 +42,9 @@ def test_a_sheet_seen_edge_on_counts_as_a_pixel_wide(shares):
     assert distance[16, peak + 8] == pytest.approx(7.5, abs=0.75)
 
 
-def test_faint_haze_is_no_sheet():
-    assert (mask_distance(np.full((16, 16), 0.04), thin_parts=True) == np.inf).all()
+@pytest.mark.parametrize("haze", [0.005, 0.04, 0.3])
+def test_faint_haze_is_no_sheet(haze):
+    assert (mask_distance(np.full((16, 16), haze), thin_parts=True) == np.inf).all()
 
 
 def blurred_disc(blur: float) -> tuple[np.ndarray, np.ndarray]:
