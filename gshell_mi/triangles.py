@@ -37,15 +37,16 @@ def positive_part(vertices: np.ndarray, faces: np.ndarray,
     """
     positive = values > 0
     number = positive[faces].sum(axis=1)
-    whole, mixed = faces[number == 3], faces[(number == 1) | (number == 2)]
+    cut = (number == 1) | (number == 2)
+    whole, mixed = faces[number == 3], faces[cut]
     # Turned so that the first corner is alone on its side.
-    lone = (positive[mixed] == (number[(number == 1) | (number == 2)] == 1)[:, None]).argmax(axis=1)
+    lone = (positive[mixed] == (number[cut] == 1)[:, None]).argmax(axis=1)
     a, b, c = np.take_along_axis(mixed, (lone[:, None] + np.arange(3)) % 3, axis=1).T
     ends = np.sort(np.stack([np.concatenate([a, a]), np.concatenate([b, c])], axis=1), axis=1)
     edges, index = np.unique(ends, axis=0, return_inverse=True)
     ab, ac = len(vertices) + index.reshape(2, -1)
     low, high = values[edges].T
-    share = (low / np.where(low == high, 1, low - high))[:, None]
+    share = (low / (low - high))[:, None]
     points = (1 - share) * vertices[edges[:, 0]] + share * vertices[edges[:, 1]]
     stays = positive[a]
     parts = [whole, np.stack([a, ab, ac], axis=1)[stays], np.stack([ab, b, c], axis=1)[~stays],
