@@ -39,14 +39,10 @@ def topology(vertices: np.ndarray, faces: np.ndarray) -> Topology:
     if len(faces) == 0:
         return Topology(len(vertices), 0, 0, 0, 0, 0.0, 0)
     edges, uses = mesh_edges(faces)
-    boundary = edges[uses == 1]
+    boundary, loop = boundary_edges(faces)
     lengths = np.linalg.norm(vertices[boundary[:, 0]] - vertices[boundary[:, 1]], axis=1)
+    loops = np.bincount(loop, lengths)
     used = np.unique(faces)
-    loops = np.array([])
-    if len(boundary):
-        label = vertex_components(boundary, len(vertices))[1]
-        loops = np.bincount(label[boundary[:, 0]], lengths)
-        loops = loops[loops > 0]
     diagonal = np.linalg.norm(np.ptp(vertices[used], axis=0))
     pinholes = int((loops <= PINHOLE * diagonal).sum())
     component = vertex_components(edges, len(vertices))[1]
@@ -59,6 +55,18 @@ def topology(vertices: np.ndarray, faces: np.ndarray) -> Topology:
         boundary_length=round(float(lengths.sum()), 6),
         nonmanifold_edges=int((uses > 2).sum()),
     )
+
+
+def boundary_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(B, 2) edges of one face each, and the boundary curve that each is on, numbered from 0.
+
+    >>> boundary_edges(np.array([[0, 1, 2], [3, 4, 5]]))[1].tolist()
+    [0, 0, 0, 1, 1, 1]
+    """
+    edges, uses = mesh_edges(faces)
+    boundary = edges[uses == 1]
+    label = vertex_components(boundary, int(faces.max(initial=-1)) + 1)[1]
+    return boundary, np.unique(label[boundary[:, 0]], return_inverse=True)[1]
 
 
 def mesh_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

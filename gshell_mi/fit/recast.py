@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from ..conversion.solid_distance import solid_distance
 from ..fields import LatticeFields
 from ..fields.smoothing import MeshDiffusion
-from ..topology import Topology, topology
-from ..triangles import area_vectors
+from ..topology import PINHOLE, Topology, boundary_edges, topology
+from ..triangles import area_vectors, positive_part
 from .opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
 from .template_sides import cast, normals_at_vertices, opposite_sides
 
@@ -48,6 +48,10 @@ _PASSES = 3
 #: So many pin-holes are let pass where no part of the movement goes without: the joint stage may shut them.
 _PINHOLES = 3
 
+#: A boundary belongs to a rim of the template if half of it is at most this many cells from one. The rim lies
+#: between the side that stays and the one that is moved away.
+_RIM = 2.0
+
 #: Parts of the movement that are tried until one does not tear the surface.
 _FRACTIONS = (1.0, 0.7, 0.4)
 
@@ -64,25 +68,29 @@ def recast(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: np
         logits: (V,) surface where positive, open elsewhere.
         radiance: (V, 3).
         min_area: smaller cuts and islands, as a fraction of the template's area, are undone.
-        wanted: what the surface is to be like.
+        wanted: what the surface is to be like. Where rims meet that have moved, a bridge closes and it has
+            more boundary loops.
         fewest_loops: so few boundary loops will do; by default as many as are wanted.
 
     Returns:
         ``sdf``, ``msdf``, ``radiance`` (n, 3) and ``known`` (n,) on the lattice; None if the surface
-        comes out with other boundary loops, more components or many more pin-holes, however little it moves.
+        comes out torn, with fewer boundary loops, more components or many more pin-holes, however little it
+        moves.
     """
-    nearly, most_loops = None, wanted.boundary_loops
-    fewest_loops = most_loops if fewest_loops is None else fewest_loops
+    nearly = None
+    fewest_loops = wanted.boundary_loops if fewest_loops is None else fewest_loops
     for fraction in _FRACTIONS:
-        fields = _fields(subject, vertices, vertices + fraction * (moved - vertices), faces, logits, radiance,
-                         min_area)
+        placed = vertices + fraction * (moved - vertices)
+        fields = _fields(subject, vertices, placed, faces, logits, radiance, min_area)
         if fields is None:
             continue
         closed = LatticeFields.closed(fields["sdf"], subject.lattice.grid)
         subject.set_fields(dataclasses.replace(closed, msdf=fields["msdf"]))
         surface_vertices, surface_faces, _ = subject.surface.to_numpy()
         found = topology(surface_vertices, surface_faces)
-        if fewest_loops <= found.boundary_loops <= most_loops and found.components <= wanted.components:
+        torn = is_torn(surface_vertices, surface_faces, *positive_part(placed, faces, logits),
+                        _RIM * subject.cell_size)
+        if found.boundary_loops >= fewest_loops and found.components <= wanted.components and not torn:
             if found.pinholes <= wanted.pinholes:
                 return fields
             if nearly is None and found.pinholes <= wanted.pinholes + _PINHOLES:
@@ -116,6 +124,23 @@ def _fields(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: n
     radiance, known = splat_to_lattice(colour, template, lattice)
     return {"sdf": sdf, "msdf": msdf.numpy(),
             "radiance": radiance.numpy().reshape(-1, 3), "known": known.numpy()}
+
+
+def is_torn(vertices: np.ndarray, faces: np.ndarray, cut_vertices: np.ndarray, cut_faces: np.ndarray,
+             near: float) -> bool:
+    """Whether a surface has a boundary, pin-holes aside, where the cut template that it is to be has none."""
+    boundary, loop = boundary_edges(faces)
+    if len(boundary) == 0:
+        return False
+    start, end = vertices[boundary].transpose(1, 0, 2)
+    length, middle = np.linalg.norm(end - start, axis=1), (start + end) / 2
+    rim = cut_vertices[boundary_edges(cut_faces)[0]].mean(axis=1)
+    far = np.ones(len(boundary), bool)
+    if len(rim):
+        far = cKDTree(rim).query(middle)[0] > near
+    whole = np.bincount(loop, length)
+    diagonal = np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0))
+    return bool(((np.bincount(loop, length * far) > 0.5 * whole) & (whole > PINHOLE * diagonal)).any())
 
 
 def thickened(before: np.ndarray, moved: np.ndarray, faces: np.ndarray, solid: np.ndarray,

@@ -6,8 +6,9 @@ import pytest
 import trimesh
 
 from gshell_mi.fields import LatticeFields
-from gshell_mi.fit.recast import recast, thickened
+from gshell_mi.fit.recast import is_torn, recast, thickened
 from gshell_mi.topology import Topology, topology
+from gshell_mi.triangles import positive_part
 
 RESOLUTION = 32
 CELL = 2 / RESOLUTION
@@ -122,3 +123,45 @@ def test_sides_that_moved_through_each_other_come_apart():
     # Both sides are surface: 0.9 cells apart, and neither has moved more than the other.
     np.testing.assert_allclose(apart[inner & upper, 2], 0.45 * CELL, atol=0.15 * CELL)
     np.testing.assert_allclose(apart[inner & ~upper, 2], -0.45 * CELL, atol=0.15 * CELL)
+
+
+def test_a_slit_that_closes_becomes_a_bridge():
+    """The upper side of a ring with a slit, whose two ends meet: two boundaries instead of one."""
+    subject, *_ = sphere()
+    inner, outer, half_slit = 0.25, 0.6, 1.2 * CELL
+    x, y, z = subject.lattice.vertex_positions().T
+    slit = np.where(x > 0, np.abs(y) - half_slit, np.hypot(x, np.abs(y) + half_slit))
+    ring = np.minimum(np.minimum(np.hypot(x, y) - inner, outer - np.hypot(x, y)), slit)
+    subject.set_fields(LatticeFields.closed(np.maximum(-ring, np.abs(z) - 0.8 * CELL)))
+    vertices, faces, _ = subject.template().to_numpy()
+    logits = np.where(vertices[:, 2] > 0.5 * CELL, 1.0, -1.0)
+    angle, radius = np.arctan2(vertices[:, 1], vertices[:, 0]), np.hypot(*vertices[:, :2].T)
+    # The ends' edges come to lie on the positive x axis.
+    closed = np.pi - (np.pi - np.abs(angle)) * np.pi / (np.pi - np.arcsin(half_slit / radius))
+    moved = vertices.copy()
+    moved[:, 0], moved[:, 1] = radius * np.cos(closed), radius * np.sin(closed) * np.sign(angle)
+    cut = topology(*positive_part(vertices, faces, logits))
+    assert cut.boundary_loops == 1
+    fields = recast(subject, vertices, moved, faces, logits, np.ones((len(vertices), 3)), 0.005, cut)
+    found = surface(subject, fields)
+    after = topology(found.vertices, found.faces)
+    assert (after.boundary_loops, after.pinholes, after.components) == (2, 0, 1)
+    assert after.boundary_length == pytest.approx(2 * np.pi * (inner + outer), rel=0.1)
+
+
+def test_a_boundary_far_from_all_rims_is_a_tear():
+    plate = trimesh.creation.box(extents=[1.3, 1.3, CELL / 3])
+    for _ in range(6):
+        plate = plate.subdivide()
+    vertices, faces = np.array(plate.vertices), np.array(plate.faces)
+    radius = np.where(vertices[:, 2] > 0, np.hypot(*vertices[:, :2].T), np.inf)
+    disc = positive_part(vertices, faces, 0.6 - radius)
+    ring = positive_part(vertices, faces, np.minimum(0.6 - radius, radius - 0.2))
+    pricked = positive_part(vertices, faces, np.minimum(0.6 - radius, radius - 0.005))
+    smaller = positive_part(vertices, faces, 0.59 - radius)
+    assert is_torn(*ring, *disc, near=0.1)
+    assert not is_torn(*ring, *ring, near=0.1)
+    assert not is_torn(*pricked, *disc, near=0.1)
+    assert not is_torn(*smaller, *disc, near=0.1)
+    assert not is_torn(vertices, faces, *disc, near=0.1)
+    assert is_torn(*disc, vertices, faces, near=0.1)
