@@ -53,6 +53,17 @@ class EnvironmentLight:
     def radiance(self) -> mi.TensorXf:
         return dr.exp(self.log_radiance)
 
+    @property
+    def solid_angles(self) -> mi.TensorXf:
+        """(height, 1, 1) of the texels of each row, relative to one at the horizon.
+
+        A gradient divided by these is that of radiance as a function on the sphere: it does not shrink with
+        the texels towards the poles.
+        """
+        height = self.log_radiance.shape[0]
+        polar = (np.arange(height, dtype=np.float32) + 0.5) * np.pi / height
+        return mi.TensorXf(np.sin(polar)[:, None, None].astype(np.float32))
+
     def emitter(self) -> mi.Emitter:
         """A new ``envmap`` emitter with the present radiance and the id ``light``."""
         return mi.load_dict({"type": "envmap", "id": "light",

@@ -107,3 +107,11 @@ def test_derivatives_reach_the_logarithm(radiance):
     gradient = np.array(dr.grad(light.log_radiance))
     assert gradient.sum(dtype=np.float64) == pytest.approx(total[0], rel=1e-3)
     assert gradient.min() > 0, "every texel is seen"
+
+
+def test_solid_angles_of_texels():
+    height = 64
+    angles = EnvironmentLight.uniform(height, 1.0).solid_angles.numpy()
+    assert angles.shape == (height, 1, 1)
+    assert angles.sum() * 2 * height * (np.pi / height) ** 2 == pytest.approx(4 * np.pi, rel=1e-3)
+    assert angles[height // 2, 0, 0] == pytest.approx(1, abs=1e-3)

@@ -16,7 +16,7 @@ from ..errors import UserError
 from ..files import replacing
 
 #: Raised when the meaning of the arrays changes.
-FORMAT = 2
+FORMAT = 3
 
 
 @dataclass

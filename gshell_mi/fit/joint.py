@@ -31,7 +31,8 @@ class JointStage:
 
     The subject's shape holds the starting geometry. For the first part of the stage only material and
     light move: geometry gradients mean nothing while the shading is wrong. If both are given, there is no
-    such part.
+    such part. Where both are sought, the material's steps grow slowly: an image knows their product only, and
+    what colours have taken up of the shading the light never gets back.
 
     Args:
         fit: the scene with its targets.
@@ -66,15 +67,17 @@ class JointStage:
                                              seed=config.seed)
         #: The lattice fields of the present step, with gradients enabled; none before the geometry moves.
         self.fields: dict[str, mi.Float] = {}
-        self.shading = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
-        if light:
-            self.shading["light"] = light.log_radiance
+        self.material_optimizer = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
+        # One step size for all texels: those that the object tells nothing of would walk at random, and a sun
+        # would not stand out.
+        self.light_optimizer = mi.ad.Adam(lr=config.light_lr, uniform=True,
+                                   params={"log_radiance": light.log_radiance} if light else None)
         self._regularisers = Regularisers(fit, self.scene, material if material.parameters else None, light,
                                           config)
 
     @property
     def optimizers(self) -> dict[str, mi.ad.Adam]:
-        return self.geometry.optimizers | {"shading": self.shading}
+        return self.geometry.optimizers | {"material": self.material_optimizer, "light": self.light_optimizer}
 
     def step(self, iteration: int) -> dict[str, float]:
         """One step on one view; returns the losses.
@@ -83,7 +86,8 @@ class JointStage:
             UserError: the steps before have left no surface.
         """
         config = self.config
-        moving = iteration >= config.warmup * config.iterations or not self.shading.state
+        given = not (self.material_optimizer.state or self.light_optimizer.state)
+        moving = given or iteration >= config.warmup * config.iterations
         with phase("scene update"):
             self._apply(geometry=moving)
         index = self._view(iteration)
@@ -102,14 +106,16 @@ class JointStage:
             compute(total)
         with phase("backward") as compute:
             dr.backward(total)
-            compute(*(dr.grad(value) for value in (*self.fields.values(), *self.shading.values())))
+            sought = (self.fields, self.material_optimizer, self.light_optimizer)
+            compute(*(dr.grad(value) for values in sought for value in values.values()))
         progress = iteration / max(config.iterations, 1)
         with phase("optimiser"):
             diffuse = LatticeDiffusion(self.subject.lattice, cells=self.subject.surface.cells)
             if moving:
                 gradients = {name: dr.grad(field) for name, field in self.fields.items()}
                 self.geometry.step(gradients, progress, iteration, diffuse)
-            self._step_shading(0.1**progress, diffuse)
+            self._step_material(progress, diffuse)
+            self._step_light(progress)
         self._follow_surface(rescan=(iteration + 1) % _RESCAN == 0)
         error = dr.mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]), axis=None)
         return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
@@ -153,11 +159,11 @@ class JointStage:
             dr.enable_grad(self.fields)
             for name, field in self.fields.items():
                 self.parameters[f"subject.{name}"] = field
-        self.material.parameters = {name: self.shading[name] for name in self.material.parameters}
+        self.material.parameters = {name: self.material_optimizer[name] for name in self.material.parameters}
         for name, field in self.material.values().items():
             self.parameters[f"subject.lattice_{name}"] = field
         if self.light:
-            self.light.log_radiance = self.shading["light"]
+            self.light.log_radiance = self.light_optimizer["log_radiance"]
             self.light.update(self.parameters)
         self.parameters.update()
         if self.subject.surface.is_empty:
@@ -171,20 +177,29 @@ class JointStage:
         if carried is None:
             return
         self.geometry.carry(carried)
-        carried.optimizer(self.shading, self.material.on_lattice)
+        carried.optimizer(self.material_optimizer, self.material.on_lattice)
         self.material.carry(carried)
 
-    def _step_shading(self, decay: float, diffuse: LatticeDiffusion) -> None:
-        config, optimizer = self.config, self.shading
+    def _step_material(self, progress: float, diffuse: LatticeDiffusion) -> None:
+        config, optimizer = self.config, self.material_optimizer
         if not optimizer.state:
             return
         for name in self.material.on_lattice:
             gradient = dr.grad(optimizer[name])
             dr.set_grad(optimizer[name], diffuse(gradient, config.material_gradient_smoothing))
-        rates = dict.fromkeys(self.material.parameters, decay * config.material_lr)
-        if self.light:
-            rates["light"] = decay * config.light_lr
-        optimizer.set_learning_rate(rates)
+        rate = 0.1**progress * config.material_lr
+        if self.light and progress < config.material_hold:
+            rate *= (progress / config.material_hold) ** 2
+        optimizer.set_learning_rate(rate)
+        optimizer.step()
+
+    def _step_light(self, progress: float) -> None:
+        optimizer = self.light_optimizer
+        if not optimizer.state:
+            return
+        gradient = dr.grad(optimizer["log_radiance"])
+        dr.set_grad(optimizer["log_radiance"], gradient / self.light.solid_angles)
+        optimizer.set_learning_rate(0.1**progress * self.config.light_lr)
         optimizer.step()
 
 

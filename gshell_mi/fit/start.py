@@ -93,7 +93,10 @@ def start_material(scene: FitScene, arrays: Mapping[str, np.ndarray], lattice: L
         total = Interpolation(mi.Float(radiance.astype(np.float32).ravel()), seen_on)(points).numpy()
         known = share > _KNOWN
         radiance = total.reshape(-1, 3) / np.maximum(share, _KNOWN)[:, None]
-    reflectance = np.where(known[:, None], radiance / arrays["light"], TYPICAL_REFLECTANCE)
+    seen = radiance / arrays["light"]
+    if config.even_start and not config.light_is_given and known.any():
+        seen = np.broadcast_to(np.median(seen[known], axis=0), seen.shape)
+    reflectance = np.where(known[:, None], seen, TYPICAL_REFLECTANCE)
     return MaterialField(reflectance, **given)
 
 

@@ -53,7 +53,7 @@ def test_a_step_is_that_on_the_whole_lattice(fit):
                                for key in optimizer.keys()}
     assert after["dense"][0] == pytest.approx(after["stored"][0], rel=1e-4)
     blocks = stored.lattice
-    everywhere = {"light", "shared_roughness", "shared_metallic"}
+    everywhere = {"log_radiance", "shared_roughness", "shared_metallic"}
     for key, (value, _, _, (_, first, second, _)) in after["stored"][1].items():
         expected = after["dense"][1][key]
         for now, then in ((value, expected[0]), (first, expected[3][1]), (second, expected[3][2])):
@@ -77,7 +77,7 @@ def test_blocks_follow_the_surface_with_all_that_is_stored_in_them(fit):
         lattice = joint.subject.lattice
         assert lattice.covers(joint.subject.surface.cells)
         for optimizer, names in ((joint.geometry.optimizer, ("sdf", "msdf", "deform")),
-                                 (joint.shading, joint.material.on_lattice)):
+                                 (joint.material_optimizer, joint.material.on_lattice)):
             for name in names:
                 value, _, _, (step, moment, _, _) = optimizer.state[name]
                 assert dr.width(value) == dr.width(moment) and dr.width(value) % lattice.vertex_count == 0
@@ -97,7 +97,7 @@ def test_material_is_carried_to_a_finer_lattice(fit):
     colors = np.where(known[:, None], 0.5 + 0.2 * points, 0)
     arrays = {"radiance": colors.astype(np.float32), "known": known, "light": np.float32(1)}
     blocks = BlockLattice.around(LATTICE, lambda p: dr.norm(p) - 0.6, mi.Float)
-    material = start_material(fit, arrays, blocks, CONFIG)
+    material = start_material(fit, arrays, blocks, replace(CONFIG, even_start=False))
     found = material.values()["vertex_color"].numpy().reshape(-1, 3)
     near = np.abs(dr.norm(blocks.points(mi.Float)).numpy() - 0.6) < 0.05
     expected = 0.5 + 0.2 * blocks.points(mi.Float).numpy().T

@@ -39,11 +39,11 @@ def stage(fit, *, top: float = 0.0, radius: float = RADIUS, noise: float = 0.0, 
 
 
 def gradients(joint: JointStage, view: int = 0) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-    """The terms of a view, and the derivative of their weighted sum with respect to fields and shading."""
+    """The terms of a view, and the derivative of their weighted sum with respect to all that is sought."""
     joint._apply(geometry=True)
     total, terms = joint._regularisers(view)
     dr.backward(total, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-    values = (*joint.fields.items(), *joint.shading.items())
+    values = (*joint.fields.items(), *joint.material_optimizer.items(), *joint.light_optimizer.items())
     found = {name: np.array(dr.grad(value)).ravel() for name, value in values}
     return {name: float(value[0]) for name, value in terms.items()}, found
 
@@ -145,14 +145,15 @@ def test_albedo_chroma_pulls_the_colour_towards_the_images(fit):
     terms, found = gradients(joint)
     red, _, blue = found["vertex_color"].reshape(-1, 3).sum(axis=0)
     assert terms["albedo_chroma"] > 0 and red < 0 < blue
-    assert not found["light"].any() and not found["sdf"].any()
+    assert not found["log_radiance"].any() and not found["sdf"].any()
 
 
 def test_light_terms_reach_the_light_only(fit):
     joint = stage(fit, light_smoothness=1.0)
-    joint.shading["light"] = mi.TensorXf(np.random.default_rng(1).normal(size=(4, 8, 3)).astype(np.float32))
+    speckle = np.random.default_rng(1).normal(size=(4, 8, 3)).astype(np.float32)
+    joint.light_optimizer["log_radiance"] = mi.TensorXf(speckle)
     terms, found = gradients(joint)
-    assert terms["light_smoothness"] > 0.5 and found["light"].any()
+    assert terms["light_smoothness"] > 0.5 and found["log_radiance"].any()
     assert not found["vertex_color"].any() and not found["msdf"].any()
 
 
