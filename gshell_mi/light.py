@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -53,7 +55,7 @@ class EnvironmentLight:
     def radiance(self) -> mi.TensorXf:
         return dr.exp(self.log_radiance)
 
-    @property
+    @cached_property
     def solid_angles(self) -> mi.TensorXf:
         """(height, 1, 1) of the texels of each row, relative to one at the horizon.
 

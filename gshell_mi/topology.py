@@ -39,9 +39,9 @@ def topology(vertices: np.ndarray, faces: np.ndarray) -> Topology:
     if len(faces) == 0:
         return Topology(len(vertices), 0, 0, 0, 0, 0.0, 0)
     edges, uses = mesh_edges(faces)
-    boundary, loop = boundary_edges(faces)
+    boundary = edges[uses == 1]
     lengths = np.linalg.norm(vertices[boundary[:, 0]] - vertices[boundary[:, 1]], axis=1)
-    loops = np.bincount(loop, lengths)
+    loops = np.bincount(_curves(boundary), lengths)
     used = np.unique(faces)
     diagonal = np.linalg.norm(np.ptp(vertices[used], axis=0))
     pinholes = int((loops <= PINHOLE * diagonal).sum())
@@ -65,8 +65,13 @@ def boundary_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     edges, uses = mesh_edges(faces)
     boundary = edges[uses == 1]
-    label = vertex_components(boundary, int(faces.max(initial=-1)) + 1)[1]
-    return boundary, np.unique(label[boundary[:, 0]], return_inverse=True)[1]
+    return boundary, _curves(boundary)
+
+
+def _curves(edges: np.ndarray) -> np.ndarray:
+    """(E,) ids, from 0, of the connected curves that edges make up."""
+    label = vertex_components(edges, int(edges.max(initial=-1)) + 1)[1]
+    return np.unique(label[edges[:, 0]], return_inverse=True)[1]
 
 
 def mesh_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

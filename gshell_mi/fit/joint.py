@@ -71,7 +71,7 @@ class JointStage:
         # One step size for all texels: those that the object tells nothing of would walk at random, and a sun
         # would not stand out.
         self.light_optimizer = mi.ad.Adam(lr=config.light_lr, uniform=True,
-                                   params={"log_radiance": light.log_radiance} if light else None)
+                                          params={"log_radiance": light.log_radiance} if light else None)
         self._regularisers = Regularisers(fit, self.scene, material if material.parameters else None, light,
                                           config)
 

@@ -89,7 +89,7 @@ def recast(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: np
         surface_vertices, surface_faces, _ = subject.surface.to_numpy()
         found = topology(surface_vertices, surface_faces)
         torn = is_torn(surface_vertices, surface_faces, *positive_part(placed, faces, logits),
-                        _RIM * subject.cell_size)
+                       _RIM * subject.cell_size)
         if found.boundary_loops >= fewest_loops and found.components <= wanted.components and not torn:
             if found.pinholes <= wanted.pinholes:
                 return fields
@@ -127,7 +127,7 @@ def _fields(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: n
 
 
 def is_torn(vertices: np.ndarray, faces: np.ndarray, cut_vertices: np.ndarray, cut_faces: np.ndarray,
-             near: float) -> bool:
+            near: float) -> bool:
     """Whether a surface has a boundary, pin-holes aside, where the cut template that it is to be has none."""
     boundary, loop = boundary_edges(faces)
     if len(boundary) == 0:
