@@ -16,7 +16,7 @@ _LEAST = {"resolution": 4, "start_resolution": 4, "band_resolution": 4, "triptyc
 
 #: Greatest sensible value, where there is one.
 _MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "unseen_area": 1, "warmup": 1,
-         "material_hold": 1, "reparam_depth": 3}
+         "color_hold": 1, "reparam_depth": 3}
 
 #: What the detail stage takes of the first steps of the joint stage for material and light.
 _CALMER = 0.3
@@ -174,13 +174,13 @@ class FitConfig:
     """Lambda of the material's Sobolev gradient on the lattice; spreads colour to what few pixels see."""
     material_lr: float = 0.2
     """Adam's step for base colour, roughness and metallic (logits)."""
-    material_hold: float = 0.5
-    """Fraction of the stage in which the material's steps grow from 0 to --material-lr if the light is
+    color_hold: float = 0.5
+    """Fraction of the stage in which the base colour's steps grow from 0 to --material-lr if the light is
     sought: shading that colours take up first, the light never gets back."""
     even_start: bool = True
     """Start from one base colour, the median of those that the ghost saw, if the light is sought; otherwise
     from what it saw, shading and all."""
-    light_lr: float = 1.0
+    light_lr: float = 0.5
     """Adam's step for the environment map (logarithm of its radiance) at the texel that is told most."""
     light_height: int = 32
     """Rows of the optimised environment map; it has twice as many columns."""
@@ -232,7 +232,7 @@ class FitConfig:
 
     def for_detail(self) -> FitConfig:
         """The settings of the joint stage as those of the detail stage, which begins where that has ended."""
-        return replace(self, iterations=self.detail_iterations, warmup=0, material_hold=0,
+        return replace(self, iterations=self.detail_iterations, warmup=0, color_hold=0,
                        material_lr=_CALMER * self.material_lr, light_lr=_CALMER * self.light_lr)
 
     @property

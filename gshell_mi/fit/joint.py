@@ -18,6 +18,7 @@ from .config import FitConfig
 from .observer import Preview
 from .opening import without_specks
 from .regularisers import Regularisers
+from .tempered_adam import TemperedAdam
 
 #: Between the first sampler seeds of fits whose seeds are neighbours: no step shares its samples.
 _SEEDS_APART = 1 << 20
@@ -31,8 +32,9 @@ class JointStage:
 
     The subject's shape holds the starting geometry. For the first part of the stage only material and
     light move: geometry gradients mean nothing while the shading is wrong. If both are given, there is no
-    such part. Where both are sought, the material's steps grow slowly: an image knows their product only, and
-    what colours have taken up of the shading the light never gets back.
+    such part. Where both are sought, the base colour's steps grow slowly: an image knows their product only,
+    and what colours have taken up of the shading the light never gets back. Roughness and metallic do not
+    wait: while they do, a light that is mirrored is sought as if it fell on plaster.
 
     Args:
         fit: the scene with its targets.
@@ -68,10 +70,8 @@ class JointStage:
         #: The lattice fields of the present step, with gradients enabled; none before the geometry moves.
         self.fields: dict[str, mi.Float] = {}
         self.material_optimizer = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
-        # One step size for all texels: those that the object tells nothing of would walk at random, and a sun
-        # would not stand out.
-        self.light_optimizer = mi.ad.Adam(lr=config.light_lr, uniform=True,
-                                          params={"log_radiance": light.log_radiance} if light else None)
+        self.light_optimizer = TemperedAdam(lr=config.light_lr, epsilon=1e-12,
+                                            params={"log_radiance": light.log_radiance} if light else None)
         self._regularisers = Regularisers(fit, self.scene, material if material.parameters else None, light,
                                           config)
 
@@ -187,10 +187,10 @@ class JointStage:
         for name in self.material.on_lattice:
             gradient = dr.grad(optimizer[name])
             dr.set_grad(optimizer[name], diffuse(gradient, config.material_gradient_smoothing))
-        rate = 0.1**progress * config.material_lr
-        if self.light and progress < config.material_hold:
-            rate *= (progress / config.material_hold) ** 2
-        optimizer.set_learning_rate(rate)
+        rates = dict.fromkeys(optimizer.keys(), 0.1**progress * config.material_lr)
+        if self.light and progress < config.color_hold:
+            rates["vertex_color"] *= (progress / config.color_hold) ** 2
+        optimizer.set_learning_rate(rates)
         optimizer.step()
 
     def _step_light(self, progress: float) -> None:

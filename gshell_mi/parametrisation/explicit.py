@@ -11,7 +11,7 @@ from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
-from .parametrisation import CHANNELS, Parametrisation, StepRules, finite
+from .parametrisation import CHANNELS, Parametrisation, StepRules, trusted
 
 
 class ExplicitGrid(Parametrisation):
@@ -51,7 +51,7 @@ class ExplicitGrid(Parametrisation):
         far, local = decay * rules.rate * self.lattice.spacing, decay * rules.deform_rate
         rates = {"sdf": far, "msdf": far, "deform": local, "weights": local}
         for name, gradient in gradients.items():
-            gradient = finite(gradient)
+            gradient = trusted(gradient)
             if name in CHANNELS:
                 gradient = diffuse(gradient, smoothing)
             dr.set_grad(optimizer[name], gradient)

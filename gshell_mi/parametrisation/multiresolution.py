@@ -12,7 +12,7 @@ from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
 from .explicit import ExplicitGrid
-from .parametrisation import CHANNELS, Parametrisation, StepRules, finite, taken, touched
+from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched, trusted
 
 #: Coarse grids beside the lattice itself: of half its cells per side, a quarter, an eighth.
 _COARSE_LEVELS = 3
@@ -62,7 +62,7 @@ class MultiresolutionGrid(Parametrisation):
     def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
              diffuse: LatticeDiffusion | None = None) -> None:
         rules, optimizer = self.rules, self.optimizer
-        own = {name: finite(gradients[name]) for name in self._names}
+        own = {name: trusted(gradients[name]) for name in self._names}
         vertex = touched(own, self.lattice.vertex_count)
         if dr.width(vertex):
             total = mi.Float(0)

@@ -15,7 +15,7 @@ from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
 from .explicit import ExplicitGrid
-from .parametrisation import CHANNELS, Parametrisation, StepRules, finite, taken, touched
+from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched, trusted
 
 #: Outputs of the network: sdf, msdf, deform.
 _OUTPUTS = 5
@@ -145,7 +145,7 @@ class NetworkFields(Parametrisation):
 
     def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
              diffuse: LatticeDiffusion | None = None) -> None:
-        own = {name: finite(gradients[name]) for name in self._start}
+        own = {name: trusted(gradients[name]) for name in self._start}
         vertex = touched(own, self.lattice.vertex_count)
         if dr.width(vertex):
             self.attach()

@@ -86,16 +86,18 @@ def test_or_with_what_was_seen(fit, seen, settings):
 
 
 def test_the_light_moves_first(fit, seen):
-    joint = start(fit, seen, replace(CONFIG, iterations=10, material_hold=0.8))
-    colors, radiances = [joint.material_optimizer["vertex_color"]], [joint.light_optimizer["log_radiance"]]
+    joint = start(fit, seen, replace(CONFIG, iterations=10, color_hold=0.8))
+    sought = ((joint.material_optimizer, "vertex_color"), (joint.material_optimizer, "vertex_roughness"),
+              (joint.light_optimizer, "log_radiance"))
+    values = [[optimizer[name].numpy() for optimizer, name in sought]]
     for iteration in range(8):
         joint.step(iteration)
-        colors.append(joint.material_optimizer["vertex_color"])
-        radiances.append(joint.light_optimizer["log_radiance"])
-    material, light = ([np.abs(after.numpy() - before.numpy()).max() for before, after in pairwise(values)]
-                       for values in (colors, radiances))
-    assert material[0] == 0 and light[0] == pytest.approx(CONFIG.light_lr, rel=1e-3)
-    assert material[7] > 5 * material[1]
+        values.append([optimizer[name].numpy() for optimizer, name in sought])
+    color, roughness, light = ([np.abs(after[i] - before[i]).max() for before, after in pairwise(values)]
+                               for i in range(3))
+    assert color[0] == 0 and light[0] == pytest.approx(CONFIG.light_lr, rel=1e-3)
+    assert color[7] > 5 * color[1]
+    assert roughness[0] == pytest.approx(CONFIG.material_lr, rel=1e-3)
 
 
 def test_a_material_under_a_given_light_need_not_wait(fit, seen):

@@ -216,7 +216,7 @@ def test_smoothing_and_rates_of_0_switch_off(bowl_scene, tmp_path):
                              "refinement-radiance-lr", "geometry-smoothing", "geometry-detail", "geometry-lr",
                              "deform-lr", "material-gradient-smoothing", "material-lr", "light-lr",
                              "checkpoint-seconds", "hull-daylight-votes", "ghost-min-area", "warmup",
-                             "material-hold")
+                             "color-hold")
            for word in (f"--{name}", "0")]
     assert main([str(bowl_scene), "-o", str(tmp_path), *SHORT, *CLOSED, "--iterations", "3", *off]) == 0
     losses = [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]

@@ -164,3 +164,19 @@ def test_offsets_stay_in_their_range():
 def test_touched_vertices():
     gradients = {"sdf": mi.Float([0, 1, 0, 0]), "deform": mi.Float([0] * 9 + [0, -2, 0])}
     assert touched(gradients, 4).numpy().tolist() == [1, 3]
+
+
+def test_one_vertex_does_not_hold_up_the_others():
+    """A derivative ten thousand times as large as all others, once, is felt as one of thirty times."""
+    lattice = TetLattice(16)
+    moved = {}
+    for outlier in (1.0, 30.0, 1e4, dr.inf):
+        made = make_parametrisation("explicit", {"sdf": dr.zeros(mi.Float, lattice.vertex_count)}, lattice)
+        for iteration in range(10):
+            gradient = np.ones(lattice.vertex_count, np.float32)
+            gradient[7] = outlier if iteration == 0 else 1
+            made.step({"sdf": mi.Float(gradient)}, 0.5, iteration)
+        moved[outlier] = -np.median(made.fields()["sdf"].numpy())
+    assert moved[1.0] > 0
+    assert moved[dr.inf] > 0.99 * moved[1.0]
+    assert moved[1e4] > 0.95 * moved[30.0] > 0.05 * moved[1.0]
