@@ -70,6 +70,7 @@ class JointStage:
         #: The lattice fields of the present step, with gradients enabled; none before the geometry moves.
         self.fields: dict[str, mi.Float] = {}
         self.material_optimizer = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
+        # What a mean over all pixels says of one texel may be smaller than the epsilon that is usual.
         self.light_optimizer = TemperedAdam(lr=config.light_lr, epsilon=1e-12,
                                             params={"log_radiance": light.log_radiance} if light else None)
         self._regularisers = Regularisers(fit, self.scene, material if material.parameters else None, light,

@@ -122,11 +122,11 @@ def trusted(gradient: mi.Float) -> mi.Float:
     >>> gradient = dr.ones(mi.Float, 1000)
     >>> gradient[7], gradient[8] = -1e5, dr.nan
     >>> print(dr.min(trusted(gradient)) > -200, trusted(gradient)[8], trusted(gradient)[0])
-    [True] 0 1
+    [True] 0.0 1.0
     """
     gradient = dr.select(dr.isfinite(gradient), gradient, 0)
     for _ in range(2):  # what is far out shifts the mean, too: the second one is without it
         size = dr.abs(gradient)
-        most = _OUTLIER * dr.sum(size) / dr.maximum(dr.sum(dr.select(size > 0, mi.Float(1), 0)), 1)
+        most = _OUTLIER * dr.sum(size) / dr.maximum(dr.count(size > 0), 1)
         gradient = dr.clip(gradient, -most, most)
     return gradient
