@@ -9,8 +9,9 @@ from typing import Any
 import drjit as dr
 
 from .errors import UserError
-from .lattice import Lattice
-from .sign_scan import MISSING, active_cells, closed_signs, pack_signs, sign_changes
+from .lattice import MISSING, Lattice
+from .sign_scan import active_cells, closed_signs, sign_changes
+from .sign_words import is_set, pack_signs, set_bits
 
 #: Cells per block along x, y, z. A row of a block has as many vertices as a machine word has bits.
 BLOCK = (32, 4, 4)
@@ -97,8 +98,8 @@ class BlockLattice:
         self.beyond: Any = pack_signs(sdf) & self.edge
         """Per row, bit i: it is the inside that lies beyond the edge vertex i."""
         dr.eval(self.beyond)
-        cells, _ = active_cells(sdf, self)
-        if dr.width(cells) and dr.any(_bit(self.edge, cells) == 1)[0]:
+        cells, _ = self.active_cells(sdf)
+        if dr.width(cells) and dr.any(is_set(self.edge, cells))[0]:
             raise UserError("the surface of sdf runs out of the blocks; BlockLattice.around finds those that "
                             "it needs")
 
@@ -189,7 +190,7 @@ class BlockLattice:
 
     def in_lattice(self, vertex: Any) -> Any:
         """Whether vertices are such, and do not only fill up a row."""
-        return _bit(self.exists, vertex) == 1
+        return is_set(self.exists, vertex)
 
     def corner(self, vertex: Any, corner: Any) -> Any:
         """The vertex at a corner (bits 0, 1, 2: x, y, z) of the cell above ``vertex``, or ``MISSING``."""
@@ -202,7 +203,7 @@ class BlockLattice:
         along = vertex & 31
         row = vertex >> 5
         within = (axis == 0) & dr.select(up, along != 31, along != 0)
-        exists = _bit(self.exists, vertex + 1, within & up) == 1
+        exists = is_set(self.exists, vertex + 1, within & up)
         above = dr.gather(self._uint_t, self.upper, row << 3 | self._uint_t(1) << axis, up & ~within)
         below = dr.gather(self._uint_t, self.lower, row * 3 + axis, ~up & ~within)
         row = dr.select(within, row, dr.select(up, above, below))
@@ -221,12 +222,32 @@ class BlockLattice:
         """Per row, bit i: its vertex i is inside. Those at the edge are what they were."""
         return (pack_signs(sdf) & ~self.edge) | self.beyond
 
-    def border(self) -> Any:
-        """Per row, bit i: its vertex i lies on the border of the whole lattice."""
-        return self._border
+    def active_cells(self, sdf: Any) -> tuple[Any, Any]:
+        """Cells whose corners have different signs, as ``sign_scan.active_cells`` of a whole lattice. What is
+        not stored has the sign of the edge."""
+        inside = self.signs(sdf)
+        if self.lattice.closes_at_border:
+            inside &= ~self.border
+        dr.eval(inside)
+        uint_t = self._uint_t
+        row = dr.arange(uint_t, dr.width(inside))
+        active = dr.zeros(uint_t)
+        for corner in range(1, 8):
+            near = dr.gather(uint_t, self.upper, row * 8 + (corner & 6))
+            exists = near != MISSING
+            other = dr.gather(uint_t, inside, near, exists)
+            compared = dr.select(exists, self.exists, 0)
+            if corner & 1:
+                near = dr.gather(uint_t, self.upper, row * 8 + corner)
+                follows = near != MISSING
+                other = other >> 1 | dr.gather(uint_t, inside, near, follows) << 31
+                compared = compared >> 1 | dr.select(follows, uint_t(1 << 31), 0)
+            active |= (other ^ inside) & compared
+        return set_bits(active), inside
 
     @cached_property
-    def _border(self) -> Any:
+    def border(self) -> Any:
+        """Per row, bit i: its vertex i lies on the border of the whole lattice."""
         last = self._stride - 1
         rest = self._first // self._stride
         x, y, z = self._first - rest * self._stride, rest % self._stride, rest // self._stride
@@ -310,10 +331,6 @@ class _Table:
             dr.eval(complete)
             result.append(complete)
         return result
-
-
-def _bit(words: Any, vertex: Any, active: Any = True) -> Any:
-    return dr.gather(type(words), words, vertex >> 5, active) >> (vertex & 31) & 1
 
 
 def _block_counts(lattice: Lattice) -> tuple[int, int, int]:

@@ -114,8 +114,7 @@ class Lattice:
     def corner(self, vertex: Any, corner: Any) -> Any:
         """The vertex at a corner (bits 0, 1, 2: steps along ``cell_vectors``) of the cell above ``vertex``,
         which must have all its corners."""
-        stride = dr.opaque(type(vertex), self.stride)
-        return vertex + (corner & 1) + (corner >> 1 & 1) * stride + (corner >> 2) * (stride * stride)
+        return vertex + corner_offset(corner, dr.opaque(type(vertex), self.stride))
 
     @property
     def vertex_count(self) -> int:
@@ -321,6 +320,11 @@ class BccLattice(Lattice):
         half = dr.opaque(float_t, self.spacing / 2)
         second = vertex >= dr.opaque(type(vertex), self.stride**3)
         return super().positions_of(vertex, float_t) + dr.select(second, half, 0)
+
+
+def corner_offset(corner: Any, stride: Any) -> Any:
+    """Difference between the ids of a cubic cell's corner (bits 0, 1, 2: x, y, z) and its lowest vertex."""
+    return (corner & 1) + (corner >> 1 & 1) * stride + (corner >> 2) * (stride * stride)
 
 
 _KINDS: dict[str, type[Lattice]] = {

@@ -1,68 +1,25 @@
-"""The signs of a field at the lattice vertices, one bit each, and the cells in which they change."""
+"""One pass over the signs of a whole lattice: the cells in which they change, and what is near."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 
-from .lattice import MISSING, BccLattice, Lattice
-
-if TYPE_CHECKING:
-    from .block_lattice import BlockLattice
-
-#: Values below this are negative. Not 0: some threads flush denormal numbers to 0 and others do not.
-NEGATIVE = -(2.0**-126)
+from .lattice import MISSING, BccLattice, Lattice, corner_offset
+from .sign_words import pack_signs, set_bits
 
 
-def corner_offset(corner: Any, stride: Any) -> Any:
-    """Difference between the ids of a cell's corner (bits 0, 1, 2: x, y, z) and of its lowest vertex."""
-    return (corner & 1) + (corner >> 1 & 1) * stride + (corner >> 2) * (stride * stride)
-
-
-def expand(bits: Any, log2_slots: int) -> tuple[Any, Any]:
-    """The set bits of an array of bit sets in order, as (index of the set, number of the bit)."""
-    uint_t = type(bits)
-    mask = (1 << log2_slots) - 1
-    lane = dr.arange(uint_t, dr.width(bits) << log2_slots)
-    if dr.width(lane):  # literals of size 1 do not go together with arrays of size 0
-        lane = dr.compress(dr.gather(uint_t, bits, lane >> log2_slots) >> (lane & mask) & 1 == 1)
-    if dr.width(lane) == 0:
-        return lane, lane
-    return lane >> log2_slots, lane & mask
-
-
-def active_cells(s: Any, lattice: Lattice | BlockLattice) -> tuple[Any, Any]:
+def active_cells(s: Any, lattice: Lattice) -> tuple[Any, Any]:
     """Cells whose corners have different signs, by their lowest vertex, and few others.
 
-    This is the one pass over the whole field, so the field is read once and packed into one bit per
-    vertex; a neighbour is then a shift in the stream of bits. The vertices at the upper borders count
-    as cells too, for the edges that they own; their corners outside the lattice are wrapped around.
+    The field is read once and packed into one bit per vertex; a neighbour is then a shift in the stream of
+    bits. The vertices at the upper borders count as cells too, for the edges that they own; their corners
+    outside the lattice are wrapped around.
 
     Returns:
         The cells and the words of signs, 32 vertices each: bit set for inside.
     """
-    if isinstance(lattice, Lattice):
-        inside = closed_signs(pack_signs(s), lattice)
-        return sign_changes(inside, lattice), inside
-    inside = lattice.signs(s)
-    if lattice.lattice.closes_at_border:
-        inside &= ~lattice.border()
-    dr.eval(inside)
-    return _sign_changes_in_blocks(inside, lattice), inside
-
-
-def pack_signs(s: Any) -> Any:
-    """Words of 32 signs; bit i of word w: the value 32 w + i is negative. Missing values repeat the last."""
-    uint_t = dr.uint32_array_t(type(s))
-    word = dr.arange(uint_t, -(-dr.width(s) // 32))
-    last = dr.opaque(uint_t, dr.width(s) - 1)
-    inside = dr.zeros(uint_t)
-    for bit in range(32):
-        value = dr.gather(type(s), s, dr.minimum(word * 32 + bit, last))
-        inside |= dr.select(value < NEGATIVE, uint_t(1 << bit), 0)
-    dr.eval(inside)
-    return inside
+    inside = closed_signs(pack_signs(s), lattice)
+    return sign_changes(inside, lattice), inside
 
 
 def closed_signs(inside: Any, lattice: Lattice) -> Any:
@@ -73,11 +30,6 @@ def closed_signs(inside: Any, lattice: Lattice) -> Any:
         dr.scatter_reduce(dr.ReduceOp.And, inside, others, border >> 5, mode=dr.ReduceMode.Local)
         dr.eval(inside)
     return inside
-
-
-def is_inside(inside: Any, vertex: Any, active: Any = True) -> Any:
-    """Whether vertices are inside, by the words of signs."""
-    return dr.gather(type(inside), inside, vertex >> 5, active) >> (vertex & 31) & 1 == 1
 
 
 def sign_changes(inside: Any, lattice: Lattice) -> Any:
@@ -97,7 +49,7 @@ def sign_changes(inside: Any, lattice: Lattice) -> Any:
         for corner in range(1, 8):
             offset = corner_offset(uint_t(corner), stride)
             active |= _shifted(inside, word, offset >> 5, offset & 31) ^ inside
-    return _set_bits(active & _bits_before(word, lattice.vertex_count))
+    return set_bits(active & _bits_before(word, lattice.vertex_count))
 
 
 def vertices_near(cells: Any, lattice: Lattice, reach: int) -> Any:
@@ -129,7 +81,7 @@ def vertices_near(cells: Any, lattice: Lattice, reach: int) -> Any:
             near |= _shifted(near, word, offset >> 5, offset & 31)
             dr.eval(near)
             covered, missing = covered + step, missing - step
-    return _set_bits(near & _bits_before(word, lattice.vertex_count))
+    return set_bits(near & _bits_before(word, lattice.vertex_count))
 
 
 def _shifted(inside: Any, word: Any, words: Any, bits: Any) -> Any:
@@ -146,36 +98,6 @@ def _bits_before(word: Any, vertex: int) -> Any:
     whole, rest = dr.opaque(uint_t, vertex // 32), dr.opaque(uint_t, vertex % 32)
     part = (dr.opaque(uint_t, 1) << rest) - 1
     return dr.select(word < whole, MISSING, dr.select(word == whole, part, 0))
-
-
-def _sign_changes_in_blocks(inside: Any, blocks: BlockLattice) -> Any:
-    """The same of stored vertices. What is not stored has the sign of the edge."""
-    uint_t = type(inside)
-    row = dr.arange(uint_t, dr.width(inside))
-    active = dr.zeros(uint_t)
-    for corner in range(1, 8):
-        near = dr.gather(uint_t, blocks.upper, row * 8 + (corner & 6))
-        exists = near != MISSING
-        other = dr.gather(uint_t, inside, near, exists)
-        compared = dr.select(exists, blocks.exists, 0)
-        if corner & 1:
-            near = dr.gather(uint_t, blocks.upper, row * 8 + corner)
-            follows = near != MISSING
-            other = other >> 1 | dr.gather(uint_t, inside, near, follows) << 31
-            compared = compared >> 1 | dr.select(follows, uint_t(1 << 31), 0)
-        active |= (other ^ inside) & compared
-    return _set_bits(active)
-
-
-def _set_bits(words: Any) -> Any:
-    """The numbers of the set bits of a stream of words."""
-    uint_t = type(words)
-    dr.eval(words)
-    found = dr.compress(words != 0)
-    if dr.width(found) == 0:
-        return found
-    owner, bit = expand(dr.gather(uint_t, words, found), 5)
-    return dr.gather(uint_t, found, owner) * 32 + bit
 
 
 def border_vertices(lattice: Lattice, uint_t: type) -> Any:

@@ -12,7 +12,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..sign_scan import MISSING, is_inside
+from ..lattice import MISSING
+from ..sign_words import is_set
 from . import tet_tables as tables
 from .grid_extraction import ActiveCells
 from .tetrahedra import TetExtraction
@@ -26,13 +27,13 @@ class BccExtraction(TetExtraction):
 
     def classify(self, inside: Any, cell: Any) -> ActiveCells:
         # A corner that does not exist takes the sign of the cell's own vertex: no edge there is crossed.
-        own = is_inside(inside, cell)
+        own = is_set(inside, cell)
         signs = dr.select(own, self.uint_t(1), 0)
         lacking = dr.zeros(self.uint_t)
         for corner in range(1, 8):
             vertex = self.corner(cell, self.uint_t(corner))
             exists = vertex != MISSING
-            sign = dr.select(exists, is_inside(inside, vertex, exists), own)
+            sign = dr.select(exists, is_set(inside, vertex, exists), own)
             signs |= dr.select(sign, self.uint_t(1 << corner), 0)
             lacking |= dr.select(exists, 0, self.uint_t(1 << corner))
         crossed = (signs ^ dr.select(own, self.uint_t(255), 0)) & self.EDGE_DIFFERENCES & ~self._lone(cell)

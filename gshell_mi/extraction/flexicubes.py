@@ -18,8 +18,8 @@ from typing import Any
 import drjit as dr
 
 from ..block_lattice import BlockLattice
-from ..lattice import FlexiCubesLattice, Lattice
-from ..sign_scan import corner_offset, expand, is_inside
+from ..lattice import FlexiCubesLattice, Lattice, corner_offset
+from ..sign_words import expand, is_set
 from . import cube_tables as tables
 from .grid_extraction import ActiveCells, GridExtraction
 from .surface_mesh import CutPoints, DualPoints, EdgePoints, SurfaceMesh, concatenate, gather
@@ -220,7 +220,7 @@ class FlexiCubesExtraction(GridExtraction):
 
     def turn(self, inside: Any, a: Any) -> list:
         """The numbers of the cubes around edges, anticlockwise seen from outside."""
-        upwards = is_inside(inside, a)
+        upwards = is_set(inside, a)
         return [self.uint_t(0), dr.select(upwards, self.uint_t(1), 2), self.uint_t(3),
                 dr.select(upwards, self.uint_t(2), 1)]
 
@@ -243,7 +243,7 @@ class FlexiCubesExtraction(GridExtraction):
         dr.eval(names)
 
         # The faces between the cubes 0 and 1, 1 and 3, 3 and 2, 2 and 0 extend along +v, -u, -v, +u.
-        upwards = is_inside(inside, a)
+        upwards = is_set(inside, a)
         order = [(2, 0), (1, 3), (3, 1), (0, 2)]
         quad = dr.arange(self.uint_t, count) << 2
         side = [

@@ -20,8 +20,9 @@ import drjit as dr
 
 from ..block_lattice import BlockLattice
 from ..errors import UserError
-from ..lattice import Lattice, array_type
-from ..sign_scan import MISSING, NEGATIVE, active_cells, corner_offset, expand, is_inside
+from ..lattice import MISSING, Lattice, array_type, corner_offset
+from ..sign_scan import active_cells
+from ..sign_words import NEGATIVE, expand, is_set
 from .surface_mesh import CutPoints, EdgePoints, Stencil, SurfaceMesh, concatenate, gather
 
 #: Field values smaller than this count as this, so that gradients of slivers stay below 1e7.
@@ -92,7 +93,8 @@ class GridExtraction(ABC):
 
     def active_cells(self, s: Any) -> ActiveCells:
         """The cells with crossed edges and few others."""
-        cell, inside = active_cells(s, self.lattice)
+        blocks = isinstance(self.lattice, BlockLattice)
+        cell, inside = self.lattice.active_cells(s) if blocks else active_cells(s, self.lattice)
         # Operands of size 0 do not go together with others of size 1.
         return self.classify(inside, cell) if dr.width(cell) else ActiveCells(inside, cell, cell, cell, cell)
 
@@ -101,12 +103,12 @@ class GridExtraction(ABC):
         for axis, coordinate in enumerate(self.coordinates(cell)):
             border |= dr.select(coordinate == self.stride - 1, self.uint_t(1 << axis), 0)
         # A corner that does not exist takes the sign of the cell's own vertex: no edge there is crossed.
-        own = is_inside(inside, cell)
+        own = is_set(inside, cell)
         signs = dr.select(own, self.uint_t(1), 0)
         for corner in range(1, 8):
             neighbour = self.corner(cell, self.uint_t(corner))
             exists = (border & corner == 0) & (neighbour != MISSING)
-            sign = dr.select(exists, is_inside(inside, neighbour, exists), own)
+            sign = dr.select(exists, is_set(inside, neighbour, exists), own)
             signs |= dr.select(sign, self.uint_t(1 << corner), 0)
         crossed = (signs ^ dr.select(own, self.uint_t(255), 0)) & self.EDGE_DIFFERENCES
         dr.eval(signs, crossed, border)

@@ -9,7 +9,8 @@ from typing import Any
 import drjit as dr
 
 from ..block_lattice import BlockLattice
-from ..sign_scan import MISSING, is_inside
+from ..lattice import MISSING
+from ..sign_words import is_set
 
 
 class Carried:
@@ -92,7 +93,7 @@ class Carried:
         field = dr.detach(field)
         value = dr.gather(float_t, field, source)
         size = dr.abs(value) + dr.opaque(float_t, self.before.spacing) * float_t(distance)
-        outward = dr.select(is_inside(self.before.signs(field), source), -size, size)
+        outward = dr.select(is_set(self.before.signs(field), source), -size, size)
         return dr.select(distance == 0, value, outward)
 
     def optimizer(self, optimizer: Any, names: Iterable[str]) -> None:

@@ -23,16 +23,6 @@ _NEIGHBOURS_KEPT = 1 << 22
 NEAR = MARGIN
 
 
-def falling(start: float, end: float, progress: float) -> float:
-    """A lambda that falls geometrically from ``start`` to ``end`` over ``progress`` in [0, 1]; 0, which is no
-    smoothing, if either is 0.
-
-    >>> [falling(8.0, 0.5, progress) for progress in (0, 0.5, 1)], falling(0.0, 0.5, 0.5)
-    ([8.0, 2.0, 0.5], 0.0)
-    """
-    return start * (end / start) ** progress if start and end else 0.0
-
-
 class LatticeDiffusion:
     """Approximates ``(I + smoothing L)^-1`` with the Laplacian L of the lattice's nearest neighbours.
 

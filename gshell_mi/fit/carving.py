@@ -13,6 +13,7 @@ from scipy import ndimage
 from .. import losses
 from ..lattice import Lattice
 from ..topology import topology
+from ..triangles import positive_part
 from .ghost_template import GhostTemplate, ghost_template
 from .hollows import SEEN, hollows
 from .justified import close_unjustified
@@ -80,7 +81,7 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, 
     clean = partial(clean_opacity, vertices=after.vertices, faces=after.faces,
                     min_area=volume.config.ghost_min_area)
     cleaned = clean(after.logits)
-    was, became = (topology(template.vertices, template.faces[(logits > 0)[template.faces].all(axis=1)])
+    was, became = (topology(*positive_part(template.vertices, template.faces, logits))
                    for template, logits in ((before, before.logits), (after, cleaned)))
     if became.boundary_loops != was.boundary_loops or became.components > was.components:
         return None

@@ -13,6 +13,7 @@ from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, principled
 from ..parametrisation import StepRules, make_parametrisation
 from ..scene import FitScene
+from ..schedules import decay_at
 from ..timing import phase
 from .config import FitConfig
 from .observer import Preview
@@ -188,7 +189,7 @@ class JointStage:
         for name in self.material.on_lattice:
             gradient = dr.grad(optimizer[name])
             dr.set_grad(optimizer[name], diffuse(gradient, config.material_gradient_smoothing))
-        rates = dict.fromkeys(optimizer.keys(), 0.1**progress * config.material_lr)
+        rates = dict.fromkeys(optimizer.keys(), decay_at(progress) * config.material_lr)
         if self.light and progress < config.color_hold:
             rates["vertex_color"] *= (progress / config.color_hold) ** 2
         optimizer.set_learning_rate(rates)
@@ -200,7 +201,7 @@ class JointStage:
             return
         gradient = dr.grad(optimizer["log_radiance"])
         dr.set_grad(optimizer["log_radiance"], gradient / self.light.solid_angles)
-        optimizer.set_learning_rate(0.1**progress * self.config.light_lr)
+        optimizer.set_learning_rate(decay_at(progress) * self.config.light_lr)
         optimizer.step()
 
 

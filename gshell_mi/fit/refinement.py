@@ -14,7 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from .. import losses
-from ..fields.smoothing import MeshDiffusion, falling
+from ..fields.smoothing import MeshDiffusion
+from ..schedules import falling
 from ..triangles import face_areas
 from .config import FitConfig
 from .observer import Preview

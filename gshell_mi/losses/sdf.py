@@ -8,8 +8,7 @@ import mitsuba as mi
 from ..activations import softplus
 from ..block_lattice import BlockLattice
 from ..extraction.surface_mesh import gather
-from ..lattice import Lattice
-from ..sign_scan import MISSING
+from ..lattice import MISSING, Lattice
 from .reduction import mean_where
 
 

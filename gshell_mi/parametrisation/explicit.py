@@ -11,6 +11,7 @@ from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
+from ..schedules import decay_at, falling
 from .parametrisation import CHANNELS, Parametrisation, StepRules, trusted
 
 
@@ -45,8 +46,8 @@ class ExplicitGrid(Parametrisation):
     def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
              diffuse: LatticeDiffusion | None = None) -> None:
         rules, optimizer = self.rules, self.optimizer
-        decay = rules.decay(progress)
-        smoothing = rules.smoothing_at(progress)
+        decay = decay_at(progress)
+        smoothing = falling(rules.smoothing, rules.detail, progress)
         diffuse = diffuse or LatticeDiffusion(self.lattice)
         far, local = decay * rules.rate * self.lattice.spacing, decay * rules.deform_rate
         rates = {"sdf": far, "msdf": far, "deform": local, "weights": local}

@@ -11,6 +11,7 @@ from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
+from ..schedules import decay_at
 from .explicit import ExplicitGrid
 from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched, trusted
 
@@ -69,7 +70,7 @@ class MultiresolutionGrid(Parametrisation):
             for name, gradient in own.items():
                 total += dr.sum(self._at(name, vertex) * taken(name, gradient, vertex))
             dr.backward(total)
-        decay = rules.decay(progress) / (1 + len(self._sizes))
+        decay = decay_at(progress) / (1 + len(self._sizes))
         far, local = decay * rules.rate * self.lattice.spacing, decay * rules.deform_rate
         optimizer.set_learning_rate({key: local if key.startswith("deform") else far
                                      for key in optimizer.keys()})

@@ -14,6 +14,7 @@ from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
+from ..schedules import decay_at
 from .explicit import ExplicitGrid
 from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched, trusted
 
@@ -152,7 +153,7 @@ class NetworkFields(Parametrisation):
             values = self._at(vertex)
             total = sum(dr.sum(values[name] * taken(name, gradient, vertex))
                         for name, gradient in own.items())
-            decay = self.rules.decay(progress)
+            decay = decay_at(progress)
             total += dr.opaque(mi.Float, _EIKONAL_WEIGHT * decay) * self._eikonal(iteration)
             dr.backward(total)
             before = {key: dr.detach(value) for key, value in self.optimizer.items()}

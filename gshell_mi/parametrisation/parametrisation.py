@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ..extraction.surface_mesh import gather
 from ..fields.carried import Carried
-from ..fields.smoothing import LatticeDiffusion, falling
+from ..fields.smoothing import LatticeDiffusion
 
 #: Values per lattice vertex of the fields that live there; the weights of FlexiCubes belong to cubes.
 CHANNELS = {"sdf": 1, "msdf": 1, "deform": 3}
@@ -32,13 +32,6 @@ class StepRules:
     """Lambda of the Sobolev gradient on the lattice at the start; only where lattice values are optimised."""
     detail: float = 0.5
     """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
-
-    def decay(self, progress: float) -> float:
-        """Factor of all rates at ``progress`` in [0, 1]."""
-        return 0.1**progress
-
-    def smoothing_at(self, progress: float) -> float:
-        return falling(self.smoothing, self.detail, progress)
 
 
 class Parametrisation(ABC):
