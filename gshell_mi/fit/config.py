@@ -161,7 +161,7 @@ class FitConfig:
     reparam_depth: int = 1
     """Path segments whose visibility is differentiated: 1 is what the camera sees, 2 adds shadows. Shapes
     come out the same with either, a dress with deep folds 0.2 dB better with 2, and 1 is faster."""
-    geometry_lr: float = 0.05
+    geometry_lr: float = 0.08
     """Largest change of sdf and mSDF per step, in cells."""
     deform_lr: float = 0.02
     """Largest change of the vertex offsets per step; 1 is the greatest offset allowed."""

@@ -24,7 +24,7 @@ _OUTLIER = 30.0
 class StepRules:
     """How far and how smoothly the fields move; the units do not depend on the lattice."""
 
-    rate: float = 0.05
+    rate: float = 0.08
     """Largest change of ``sdf`` and ``msdf`` per step at the start, in cells; falls tenfold."""
     deform_rate: float = 0.02
     """The same of ``deform`` and ``weights``."""
