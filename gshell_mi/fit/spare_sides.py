@@ -17,6 +17,7 @@ from ..fields.smoothing import MeshDiffusion
 from ..topology import Topology, mesh_edges, patch_sizes, topology, vertex_components
 from ..triangles import positive_part
 from .opening import also_opened, clean_opacity
+from .small_sheets import small_sheets
 from .template_sides import normals_at_vertices, opposite_sides
 
 #: Parts are thin up to this thickness, in cells.
@@ -82,6 +83,8 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
     thickness, opposite = opposite_sides(before, cut.positions, faces, cell)
     normals, smooth = normals_at_vertices(before, faces), MeshDiffusion(faces, len(solid), _SMOOTHING)
     spare, sheets = spare_sides(thickness, opposite, normals, faces, solid, smooth, cell, sheet_thickness)
+    small, count = small_sheets(cut.positions, normals, faces, ~solid | spare, sheet_thickness * cell)
+    spare, sheets = spare | small, sheets + count
     if not spare.any():
         return None
     logits, _ = also_opened(cut.logits, spare, smooth)

@@ -134,3 +134,19 @@ def test_the_largest_opening_grows_first():
     opened = found.logits < 0
     within = (radius < RADIUS - 2 * CELL) & (from_small > 4 * CELL)
     assert opened[within & ~upper].all() and not opened[within & upper].any()
+
+
+def test_an_island_of_a_few_cells_is_a_sheet_too():
+    """Beside a large plate that is open below, a small one, not round, whose edge is most of it."""
+    points = TetLattice(RESOLUTION).vertex_positions()
+    radius = np.hypot(points[:, 0] + 0.2, points[:, 1])
+    large = radius - 0.5
+    small = np.hypot(points[:, 0] - 0.6, 0.6 * points[:, 1]) - 1.6 * CELL
+    sheet = np.minimum(large, small)
+    vertices, faces = template(np.maximum(np.abs(points[:, 2] - HEIGHT) - 0.8 * CELL, sheet))
+    radius, upper = np.hypot(vertices[:, 0] + 0.2, vertices[:, 1]), vertices[:, 2] > HEIGHT
+    found = cut(vertices, flattened(vertices, 0.2), faces, upper | (radius > 0.2))
+    assert (found.topology.boundary_loops, found.topology.components) == (2, 2)
+    island = vertices[:, 0] > 0.4
+    opened = [(found.logits < 0)[island & side].mean() for side in (upper, ~upper)]
+    assert max(opened) > 0.9 and min(opened) < 0.2
