@@ -42,8 +42,8 @@ SPP, FEW = 128, 4
 #: Points on surfaces for one finite difference
 POINTS = 400_000
 
-#: Standard errors that end the repeats, relative: of what is compared to 1 % at many samples and at few, and of
-#: the rest
+#: Relative standard errors that end the repeats: of what is compared to 1 %, at many samples and at few, and
+#: of the rest
 FINE, FEW_FINE, COARSE = 0.003, 0.004, 0.01
 
 
@@ -193,9 +193,9 @@ the steps h and 2 h, and the same with half of h. The two images of a difference
 and are sampled at points fixed on the surfaces (`pipelines/surface_differences.py`). `gshell_path` uses
 `reparam_depth` = depth, and `light_edge_samples` 16 at 128 spp, 1 at 4 spp. Every figure is repeated with
 new seeds until its standard error is 0.3 % (0.4 % at 4 spp; 1 % at half the step and for Mitsuba's
-integrators) or the time is up. "Right": within 1 % of FD or two standard errors. "Corr.": correlation of the gradient image
-with that of finite differences (both blurred by one pixel). "fwd - rev": relative difference of forward
-and reverse mode with one seed. The last columns are Mitsuba's projective integrators with default
+integrators) or the time is up. "Right": within 1 % of FD or two standard errors. "Corr.": correlation of the
+gradient image with that of finite differences (both blurred by one pixel). "fwd - rev": relative difference
+of forward and reverse mode with one seed. The last columns are Mitsuba's projective integrators with default
 settings at 16 spp (in brackets their correlation).
 
 """

@@ -105,7 +105,7 @@ class FitConfig:
     # --- photometric refinement: moves the surface inside the hull
     refinement_iterations: int = 400
     """Steps of the photometric refinement; 0 keeps the hull's shape."""
-    refinement_lr: float = 0.2
+    refinement_lr: float = 0.12
     """Largest movement of a vertex per step, in cells; falls to 0 like a cosine."""
     refinement_smoothing: float = 95.0
     """Lambda of the Sobolev gradient on the template when it starts to move, in square cells: whole parts

@@ -15,6 +15,7 @@ import numpy as np
 
 from .. import losses
 from ..fields.smoothing import MeshDiffusion
+from ..outliers import trusted
 from ..schedules import falling
 from ..triangles import face_areas
 from .config import FitConfig
@@ -24,6 +25,9 @@ from .radiance_ghost import SIDES, RadianceGhost
 
 #: Views whose outlines a step compares.
 _OUTLINE_VIEWS = 8
+
+#: Multiple of their mean size that no derivative exceeds in a step; small, as it takes many to move a region.
+_OUTLIER = 10.0
 
 #: Steps after which the Sobolev gradient is factorised with the lambda of the day.
 _FACTORISE_EVERY = 64
@@ -91,9 +95,8 @@ class PhotometricRefinement:
             start = (iteration - iteration % _FACTORISE_EVERY) / config.refinement_iterations
             smoothing = falling(config.refinement_smoothing, config.refinement_detail, start)
             self._diffuse = MeshDiffusion(self.faces, self.ghost.vertex_count, self._density * smoothing)
-        gradient = dr.grad(optimizer["positions"])
-        gradient = self._diffuse(dr.select(dr.isfinite(gradient), gradient, 0))
-        dr.set_grad(optimizer["positions"], gradient)
+        gradient = trusted(dr.grad(optimizer["positions"]), _OUTLIER)
+        dr.set_grad(optimizer["positions"], self._diffuse(gradient))
         decay = 0.5 * (1 + np.cos(np.pi * progress))
         optimizer.set_learning_rate({"positions": decay * config.refinement_lr * self.length})
         optimizer.step()

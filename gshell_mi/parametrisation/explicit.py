@@ -11,8 +11,9 @@ from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
+from ..outliers import trusted
 from ..schedules import decay_at, falling
-from .parametrisation import CHANNELS, Parametrisation, StepRules, trusted
+from .parametrisation import CHANNELS, Parametrisation, StepRules
 
 
 class ExplicitGrid(Parametrisation):

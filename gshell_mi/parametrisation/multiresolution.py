@@ -11,9 +11,10 @@ from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
+from ..outliers import trusted
 from ..schedules import decay_at
 from .explicit import ExplicitGrid
-from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched, trusted
+from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched
 
 #: Coarse grids beside the lattice itself: of half its cells per side, a quarter, an eighth.
 _COARSE_LEVELS = 3

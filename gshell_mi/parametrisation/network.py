@@ -14,9 +14,10 @@ from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import Lattice
+from ..outliers import trusted
 from ..schedules import decay_at
 from .explicit import ExplicitGrid
-from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched, trusted
+from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched
 
 #: Outputs of the network: sdf, msdf, deform.
 _OUTPUTS = 5

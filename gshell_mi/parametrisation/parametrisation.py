@@ -16,9 +16,6 @@ from ..fields.smoothing import LatticeDiffusion
 #: Values per lattice vertex of the fields that live there; the weights of FlexiCubes belong to cubes.
 CHANNELS = {"sdf": 1, "msdf": 1, "deform": 3}
 
-#: Multiple of the mean size of a field's derivatives that none of them exceeds in a step.
-_OUTLIER = 30.0
-
 
 @dataclass(frozen=True)
 class StepRules:
@@ -100,26 +97,3 @@ def touched(gradients: Mapping[str, mi.Float], vertex_count: int) -> mi.UInt32:
         for channel in range(CHANNELS[name]):
             found |= dr.gather(mi.Float, gradient, CHANNELS[name] * vertex + channel) != 0
     return dr.compress(found)
-
-
-def trusted(gradient: mi.Float) -> mi.Float:
-    """The derivatives of a field without what no step may follow.
-
-    Slivers make derivatives overflow; they count as 0 then. And a crossing between the values ``s`` and ``t``
-    moves as ``1 / (s - t)^2``: where both are near 0, one sample outweighs the whole surface. Adam with one
-    step size for a field goes by the largest derivative and remembers it for a thousand steps, so one such
-    vertex would hold up all others for the rest of a stage. What is larger than 30 times the mean size counts
-    as that; in a usual step that is one vertex in a hundred.
-
-    >>> import drjit as dr, mitsuba as mi
-    >>> gradient = dr.ones(mi.Float, 1000)
-    >>> gradient[7], gradient[8] = -1e5, dr.nan
-    >>> print(dr.min(trusted(gradient)) > -200, trusted(gradient)[8], trusted(gradient)[0])
-    [True] 0.0 1.0
-    """
-    gradient = dr.select(dr.isfinite(gradient), gradient, 0)
-    for _ in range(2):  # what is far out shifts the mean, too: the second one is without it
-        size = dr.abs(gradient)
-        most = _OUTLIER * dr.sum(size) / dr.maximum(dr.count(size > 0), 1)
-        gradient = dr.clip(gradient, -most, most)
-    return gradient

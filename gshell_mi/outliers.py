@@ -1,0 +1,27 @@
+"""Single derivatives that no step may follow."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+def trusted(gradient: mi.Float, most: float = 30.0) -> mi.Float:
+    """Derivatives of which none is larger than ``most`` times the mean size of those that are not 0.
+
+    Slivers make derivatives overflow; they count as 0 then. And where a derivative is that of a ratio, such
+    as of a crossing between two values near 0, or of a hit of a triangle seen from its edge, one sample may
+    outweigh the whole surface. Adam with one step size for all goes by the largest derivative and remembers
+    it for a hundred to a thousand steps, so one such vertex would hold up all others.
+
+    >>> gradient = dr.ones(mi.Float, 1000)
+    >>> gradient[7], gradient[8] = -1e5, dr.nan
+    >>> print(dr.min(trusted(gradient)) > -200, trusted(gradient)[8], trusted(gradient)[0])
+    [True] 0.0 1.0
+    """
+    gradient = dr.select(dr.isfinite(gradient), gradient, 0)
+    for _ in range(2):  # what is far out shifts the mean, too: the second one is without it
+        size = dr.abs(gradient)
+        largest = most * dr.sum(size) / dr.maximum(dr.count(size > 0), 1)
+        gradient = dr.clip(gradient, -largest, largest)
+    return gradient
