@@ -28,11 +28,10 @@ Importing the package sets no variant; its plugins register for the variant in u
 True
 """
 
-from .block_lattice import BlockLattice
 from .errors import UserError
 from .extraction import SurfaceMesh, extract
 from .fields import LatticeFields
-from .lattice import BccLattice, CubeLattice, FlexiCubesLattice, TetLattice, make_lattice
+from .lattice import BccLattice, BlockLattice, CubeLattice, FlexiCubesLattice, TetLattice, make_lattice
 from .plugins import register_on_variant_change
 
 __version__ = "0.1.0"

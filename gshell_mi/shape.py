@@ -8,14 +8,13 @@ import mitsuba as mi
 import numpy as np
 
 from . import compat, memory
-from .block_lattice import BlockLattice
 from .conversion import from_mesh
 from .errors import UserError
 from .extraction import SurfaceMesh, extract
 from .extraction.surface_mesh import gather
 from .fields import LatticeFields, sphere
 from .fields.carried import Carried
-from .lattice import make_lattice
+from .lattice import BlockLattice, make_lattice
 from .timing import phase
 
 _FIELDS = ("sdf", "msdf", "deform", "weights")

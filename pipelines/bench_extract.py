@@ -31,9 +31,8 @@ import drjit.llvm.ad as llvm
 import numpy as np
 from skimage.measure import marching_cubes
 
-from gshell_mi.block_lattice import BlockLattice
 from gshell_mi.extraction import extract
-from gshell_mi.lattice import GRIDS, make_lattice
+from gshell_mi.lattice import GRIDS, BlockLattice, make_lattice
 
 #: Bars: exponent of the times, and peak memory in MiB by resolution.
 EXPONENT, MEMORY = 2.2, {256: 512, 512: 2048}

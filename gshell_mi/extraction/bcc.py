@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 
 from ..lattice import MISSING
-from ..sign_words import is_set
+from ..lattice.sign_words import is_set
 from . import tet_tables as tables
 from .grid_extraction import ActiveCells
 from .tetrahedra import TetExtraction

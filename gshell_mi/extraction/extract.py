@@ -4,9 +4,8 @@ from typing import Any
 
 import drjit as dr
 
-from ..block_lattice import BlockLattice
 from ..errors import UserError
-from ..lattice import BccLattice, CubeLattice, FlexiCubesLattice, Lattice, TetLattice
+from ..lattice import BccLattice, BlockLattice, CubeLattice, FlexiCubesLattice, Lattice, TetLattice
 from .bcc import BccExtraction
 from .cubes import CubeExtraction
 from .flexicubes import FlexiCubesExtraction

@@ -17,9 +17,9 @@ from typing import Any
 
 import drjit as dr
 
-from ..block_lattice import BlockLattice
-from ..lattice import FlexiCubesLattice, Lattice, corner_offset
-from ..sign_words import expand, is_set
+from ..lattice import BlockLattice, FlexiCubesLattice, Lattice
+from ..lattice.lattice import corner_offset
+from ..lattice.sign_words import expand, is_set
 from . import cube_tables as tables
 from .grid_extraction import ActiveCells, GridExtraction
 from .surface_mesh import CutPoints, DualPoints, EdgePoints, SurfaceMesh, concatenate, gather

@@ -18,11 +18,11 @@ from typing import Any, ClassVar
 
 import drjit as dr
 
-from ..block_lattice import BlockLattice
 from ..errors import UserError
-from ..lattice import MISSING, Lattice, array_type, corner_offset
-from ..sign_scan import active_cells
-from ..sign_words import NEGATIVE, expand, is_set
+from ..lattice import MISSING, BlockLattice, Lattice, array_type
+from ..lattice.lattice import corner_offset
+from ..lattice.sign_scan import active_cells
+from ..lattice.sign_words import NEGATIVE, expand, is_set
 from .surface_mesh import CutPoints, EdgePoints, Stencil, SurfaceMesh, concatenate, gather
 
 #: Field values smaller than this count as this, so that gradients of slivers stay below 1e7.

@@ -11,7 +11,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..sign_words import expand
+from ..lattice.sign_words import expand
 from . import tet_tables as tables
 from .grid_extraction import ActiveCells, MarchingExtraction
 from .surface_mesh import concatenate

@@ -8,9 +8,8 @@ from typing import Any
 
 import drjit as dr
 
-from ..block_lattice import BlockLattice
-from ..lattice import MISSING
-from ..sign_words import is_set
+from ..lattice import MISSING, BlockLattice
+from ..lattice.sign_words import is_set
 
 
 class Carried:

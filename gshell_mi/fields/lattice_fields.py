@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..block_lattice import BlockLattice
 from ..errors import UserError
-from ..lattice import Lattice, lattice_of, make_lattice
+from ..lattice import BlockLattice, Lattice, lattice_of, make_lattice
 
 #: Steps that find the point an offset has brought somewhere; the error halves with each, or better.
 _FIXED_POINT_STEPS = 4

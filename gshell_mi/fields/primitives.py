@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..block_lattice import BlockLattice
 from ..errors import UserError
-from ..lattice import Lattice
+from ..lattice import BlockLattice, Lattice
 from .lattice_fields import LatticeFields
 
 

@@ -11,9 +11,9 @@ from cholespy import CholeskySolverF, MatrixType
 from scipy.sparse import coo_matrix, eye
 from scipy.sparse.csgraph import laplacian
 
-from ..block_lattice import MARGIN, BlockLattice
-from ..lattice import MISSING, Lattice
-from ..sign_scan import vertices_near
+from ..lattice import MISSING, BlockLattice, Lattice
+from ..lattice.block_lattice import MARGIN
+from ..lattice.sign_scan import vertices_near
 from ..topology import mesh_edges
 
 #: Vertices of blocks, at most, whose neighbours are kept, in 24 bytes each: it takes half the time.

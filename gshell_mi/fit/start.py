@@ -7,11 +7,10 @@ from collections.abc import Mapping
 import mitsuba as mi
 import numpy as np
 
-from ..block_lattice import BlockLattice
 from ..errors import UserError
 from ..fields import LatticeFields
 from ..fields.interpolation import Interpolation
-from ..lattice import Lattice, lattice_of, make_lattice
+from ..lattice import BlockLattice, Lattice, lattice_of, make_lattice
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, given_material
 from ..scene import FitScene

@@ -6,9 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..activations import softplus
-from ..block_lattice import BlockLattice
 from ..extraction.surface_mesh import gather
-from ..lattice import MISSING, Lattice
+from ..lattice import MISSING, BlockLattice, Lattice
 from .reduction import mean_where
 
 

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 import drjit as dr
 import mitsuba as mi
 
-from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
-from ..lattice import Lattice
+from ..lattice import BlockLattice, Lattice
 from ..outliers import trusted
 from ..schedules import decay_at, falling
 from .parametrisation import CHANNELS, Parametrisation, StepRules

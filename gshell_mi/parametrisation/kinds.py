@@ -6,9 +6,8 @@ from collections.abc import Mapping
 
 import mitsuba as mi
 
-from ..block_lattice import BlockLattice
 from ..errors import UserError
-from ..lattice import Lattice
+from ..lattice import BlockLattice, Lattice
 from .explicit import ExplicitGrid
 from .hashgrid import HashGridNetwork
 from .multiresolution import MultiresolutionGrid

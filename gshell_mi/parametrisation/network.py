@@ -10,10 +10,9 @@ import mitsuba as mi
 import numpy as np
 from drjit import nn
 
-from ..block_lattice import BlockLattice
 from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
-from ..lattice import Lattice
+from ..lattice import BlockLattice, Lattice
 from ..outliers import trusted
 from ..schedules import decay_at
 from .explicit import ExplicitGrid

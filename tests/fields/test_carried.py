@@ -3,10 +3,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from gshell_mi.block_lattice import BlockLattice
 from gshell_mi.extraction import extract
 from gshell_mi.fields.carried import Carried
-from gshell_mi.lattice import TetLattice
+from gshell_mi.lattice import BlockLattice, TetLattice
 
 LATTICE = TetLattice(80)
 

@@ -8,11 +8,10 @@ import scipy.sparse as sp
 from scipy.ndimage import binary_dilation
 from scipy.sparse.linalg import spsolve
 
-from gshell_mi.block_lattice import BlockLattice
 from gshell_mi.fields import smoothing
 from gshell_mi.fields.smoothing import LatticeDiffusion
-from gshell_mi.lattice import Lattice, TetLattice, make_lattice
-from gshell_mi.sign_scan import active_cells, vertices_near
+from gshell_mi.lattice import BlockLattice, Lattice, TetLattice, make_lattice
+from gshell_mi.lattice.sign_scan import active_cells, vertices_near
 
 N = 9
 LATTICE = TetLattice(N - 1)

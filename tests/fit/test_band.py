@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from bowl import CLOSED, RADIUS, SHORT
 
-from gshell_mi.block_lattice import BlockLattice
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.checkpoint import Checkpoint
 from gshell_mi.fit.joint import JointStage
 from gshell_mi.fit.start import start_material
-from gshell_mi.lattice import TetLattice
+from gshell_mi.lattice import BlockLattice, TetLattice
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField
 from gshell_mi.scene import load_fit_scene

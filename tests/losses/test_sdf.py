@@ -7,8 +7,7 @@ import pytest
 from closed_form import value
 
 from gshell_mi import losses
-from gshell_mi.block_lattice import BlockLattice
-from gshell_mi.lattice import TetLattice
+from gshell_mi.lattice import BlockLattice, TetLattice
 
 LATTICE = TetLattice(12)
 

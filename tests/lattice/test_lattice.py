@@ -7,7 +7,8 @@ import pytest
 
 from gshell_mi import UserError
 from gshell_mi.extraction.tet_tables import TETS, corner_position
-from gshell_mi.lattice import MAX_OFFSET_CELLS, TetLattice
+from gshell_mi.lattice import TetLattice
+from gshell_mi.lattice.lattice import MAX_OFFSET_CELLS
 
 
 def test_layout():

@@ -5,9 +5,8 @@ import pytest
 from topology import assert_manifold, boundary_edges
 
 from gshell_mi import UserError
-from gshell_mi.block_lattice import BlockLattice
 from gshell_mi.extraction import extract
-from gshell_mi.lattice import GRIDS, TetLattice, make_lattice
+from gshell_mi.lattice import GRIDS, BlockLattice, TetLattice, make_lattice
 
 
 def test_a_grid_without_blocks_is_refused():

@@ -1,4 +1,4 @@
-"""The lattices on which the fields live: cubic cells, whole or split into tetrahedra."""
+"""The kinds of lattices: cubic cells, whole or split into tetrahedra."""
 
 import importlib
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from .errors import UserError
+from ..errors import UserError
 
 #: Stands for a vertex that does not exist.
 MISSING = 0xFFFFFFFF

@@ -8,7 +8,7 @@ from typing import Any
 
 import drjit as dr
 
-from .errors import UserError
+from ..errors import UserError
 from .lattice import MISSING, Lattice
 from .sign_scan import active_cells, closed_signs, sign_changes
 from .sign_words import is_set, pack_signs, set_bits

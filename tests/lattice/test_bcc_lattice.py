@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from gshell_mi import UserError
-from gshell_mi.block_lattice import BlockLattice
 from gshell_mi.extraction.tet_tables import TETS
 from gshell_mi.fields.interpolation import Interpolation
-from gshell_mi.lattice import MAX_OFFSET_CELLS_BCC, MISSING, BccLattice, lattice_of
+from gshell_mi.lattice import MISSING, BccLattice, BlockLattice, lattice_of
+from gshell_mi.lattice.lattice import MAX_OFFSET_CELLS_BCC
 
 RESOLUTIONS = (1, 2, 3, 5)
 

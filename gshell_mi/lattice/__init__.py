@@ -1,0 +1,19 @@
+"""The lattices on which the fields live, whole or stored around a surface."""
+
+from .block_lattice import BlockLattice
+from .lattice import (
+    GRIDS,
+    MISSING,
+    BccLattice,
+    CubeLattice,
+    CubicGrid,
+    FlexiCubesLattice,
+    Lattice,
+    TetLattice,
+    array_type,
+    lattice_of,
+    make_lattice,
+)
+
+__all__ = ["GRIDS", "MISSING", "BccLattice", "BlockLattice", "CubeLattice", "CubicGrid", "FlexiCubesLattice",
+           "Lattice", "TetLattice", "array_type", "lattice_of", "make_lattice"]
