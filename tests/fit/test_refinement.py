@@ -153,3 +153,20 @@ def test_views_it_did_not_see_judge_the_refinement(capture):
         ghost.refit(np.ones(len(points), bool))
         errors.append(ghost.unexplained(unknown))
     assert errors[1] < 0.95 * errors[0]
+
+
+def test_one_vertex_holds_up_no_others(capture):
+    """Far from a vertex whose derivative is thousands of times the others', these move as far as without."""
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    far = vertices[:, 0] < 0
+    moved = []
+    for outlier in (1.0, 1e4, np.inf):
+        round_ = refinement(capture, vertices, faces, False)
+        gradient = vertices.astype(np.float32).copy()
+        gradient[vertices[:, 0].argmax(), 0] = RADIUS * outlier
+        dr.enable_grad(round_.optimizer["positions"])
+        dr.set_grad(round_.optimizer["positions"], mi.Float(gradient.ravel()))
+        round_._move(0.0, 0)
+        moved.append(np.linalg.norm(round_.positions() - vertices, axis=1)[far].mean())
+    assert min(moved[1:]) > 0.6 * moved[0] > 0
