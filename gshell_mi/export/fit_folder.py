@@ -19,27 +19,37 @@ from .stock_scene import MAX_DEPTH, write_light, write_scene
 
 if TYPE_CHECKING:
     from ..extraction import SurfaceMesh
-    from ..fit.config import FitConfig
-    from ..fit.joint import JointStage
+    from ..light import EnvironmentLight
+    from ..material import GivenMaterial, MaterialField
     from ..scene import FitScene
 
 _EXPORT_SPP = 32
 
 
-def export_fit(output: Path, fit: FitScene, joint: JointStage, config: FitConfig) -> dict:
-    """Writes meshes, light, scene and triptychs; returns the metrics, which ``write_metrics`` stores."""
+def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMaterial,
+               light: EnvironmentLight | None, views: int) -> dict:
+    """Writes meshes, light, scene and triptychs.
+
+    Args:
+        fit: its subject is the result.
+        light: None if it is the scene's own.
+        views: how many, spread evenly, are rendered.
+
+    Returns:
+        The metrics, which ``write_metrics`` stores.
+    """
     surface = fit.subject.surface
     attributes = {}
-    for name, field in joint.material.values().items():
+    for name, field in material.values().items():
         channels = 3 if name == "vertex_color" else 1
         values = np.array(surface.interpolate(field, channels).numpy())
         attributes[name] = values.T if channels == 3 else values
     _write_surface(output / "mesh.ply", surface, attributes)
     template = fit.subject.template()
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
-    write_light(output / "light.exr", fit.light, joint.light)
+    write_light(output / "light.exr", fit.light, light)
     write_scene(output / "scene.xml", fit.light, fit.sensors)
-    scores = _write_views(output, fit, config.triptychs)
+    scores = _write_views(output, fit, views)
     vertices, faces, _ = surface.to_numpy()
     return {
         "scene": fit.path.name,
@@ -49,7 +59,6 @@ def export_fit(output: Path, fit: FitScene, joint: JointStage, config: FitConfig
         "counts": dataclasses.asdict(topology(vertices, faces)),
         "versions": {name: version(name) for name in ("gshell_mi", "mitsuba", "drjit", "numpy")},
         "variant": mi.variant(),
-        "config": dataclasses.asdict(config),
     }
 
 

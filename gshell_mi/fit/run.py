@@ -159,7 +159,9 @@ class _Fit:
             joint = self._joint()
             self.interrupt.check()
             with self.progress.stage("export", None), self.books.timed("export"):
-                metrics = export_fit(self.output, self.scene, joint, self.config)
+                metrics = export_fit(self.output, self.scene, joint.material, joint.light,
+                                     self.config.triptychs)
+                metrics["config"] = _plain(self.config)
                 metrics |= findings(self.scene, self.views, joint.scene, self.progress.warn)
             metrics = self._write_metrics(metrics)
             if self.report:
