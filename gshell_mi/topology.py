@@ -41,7 +41,7 @@ def topology(vertices: np.ndarray, faces: np.ndarray) -> Topology:
     edges, uses = mesh_edges(faces)
     boundary = edges[uses == 1]
     lengths = np.linalg.norm(vertices[boundary[:, 0]] - vertices[boundary[:, 1]], axis=1)
-    loops = np.bincount(_curves(boundary), lengths)
+    loops = np.bincount(curve_ids(boundary), lengths)
     used = np.unique(faces)
     diagonal = np.linalg.norm(np.ptp(vertices[used], axis=0))
     pinholes = int((loops <= PINHOLE * diagonal).sum())
@@ -65,10 +65,10 @@ def boundary_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     edges, uses = mesh_edges(faces)
     boundary = edges[uses == 1]
-    return boundary, _curves(boundary)
+    return boundary, curve_ids(boundary)
 
 
-def _curves(edges: np.ndarray) -> np.ndarray:
+def curve_ids(edges: np.ndarray) -> np.ndarray:
     """(E,) ids, from 0, of the connected curves that edges make up."""
     label = vertex_components(edges, int(edges.max(initial=-1)) + 1)[1]
     return np.unique(label[edges[:, 0]], return_inverse=True)[1]
@@ -89,6 +89,15 @@ def vertex_components(edges: np.ndarray, vertex_count: int) -> tuple[int, np.nda
     weights = np.ones(len(edges), np.int8)
     graph = coo_matrix((weights, (edges[:, 0], edges[:, 1])), shape=(vertex_count, vertex_count))
     return connected_components(graph, directed=False)
+
+
+def mesh_components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """(V,) ids of the connected components of a mesh with (F, 3) faces.
+
+    >>> mesh_components(np.array([[0, 1, 2], [3, 4, 5]]), 6).tolist()
+    [0, 0, 0, 1, 1, 1]
+    """
+    return vertex_components(mesh_edges(faces)[0], vertex_count)[1]
 
 
 def patch_sizes(patch: np.ndarray, whole: np.ndarray, counted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 
 from ..lattice import CubicGrid, Lattice
-from ..topology import boundary_edges
+from ..topology import curve_ids
 from ..triangles import unit
 
 _PAIRS = 1 << 22  # vertices times triangles at once: some 200 MiB
@@ -107,7 +107,7 @@ class MeshFeet:
         self._edge_normals = np.zeros((len(edges), 3))
         np.add.at(self._edge_normals, inverse, mesh.face_normals[mesh.edges_face])
         self._edge_on_rim = uses == 1
-        self.rim_edges, self._rim = boundary_edges(mesh.faces)
+        self.rim_edges = edges[self._edge_on_rim]
         self._vertex_on_rim = np.zeros(len(mesh.vertices), bool)
         self._vertex_on_rim[self.rim_edges] = True
 
@@ -145,4 +145,4 @@ class MeshFeet:
         steps = np.ceil(np.linalg.norm(end - start, axis=1) / spacing).astype(int) + 1
         edge = np.repeat(np.arange(len(start)), steps)
         t = (np.arange(len(edge)) - np.repeat(np.cumsum(steps) - steps, steps)) / np.repeat(steps, steps)
-        return start[edge] + t[:, None] * (end - start)[edge], self._rim[edge]
+        return start[edge] + t[:, None] * (end - start)[edge], curve_ids(self.rim_edges)[edge]

@@ -9,7 +9,7 @@ import numpy as np
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields.smoothing import LatticeDiffusion, MeshDiffusion
 from ..lattice import Lattice
-from ..topology import equal_patches, mesh_edges, vertex_components
+from ..topology import equal_patches, mesh_components
 from ..triangles import face_areas
 
 #: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
@@ -41,7 +41,7 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
     for corner in range(3):
         np.add.at(area, faces[:, corner], face_areas(vertices, faces) / 3)
     cleaned = logits.copy()
-    piece = vertex_components(mesh_edges(faces)[0], len(vertices))[1]
+    piece = mesh_components(faces, len(vertices))
     piece_area = np.bincount(piece, area)[piece]
     # Cuts first: an island in a cut that closes is none.
     for flip_closed in (False, True):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from ..topology import mesh_edges, vertex_components
+from ..topology import mesh_components
 
 
 def small_sheets(moved: np.ndarray, normals: np.ndarray, faces: np.ndarray, others: np.ndarray,
@@ -31,7 +31,7 @@ def small_sheets(moved: np.ndarray, normals: np.ndarray, faces: np.ndarray, othe
     >>> small_sheets(np.array(box.vertices), normals, box.faces, none, 0.05)[1]
     0
     """
-    part = vertex_components(mesh_edges(faces)[0], len(moved))[1]
+    part = mesh_components(faces, len(moved))
     side, count = np.zeros(len(moved), bool), 0
     for index in np.flatnonzero(np.bincount(part, others) == 0):
         mesh = trimesh.Trimesh(moved, faces[part[faces[:, 0]] == index], process=False)
