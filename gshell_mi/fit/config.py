@@ -22,8 +22,9 @@ _MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "unse
 _CALMER = 0.3
 
 #: What ``--preview`` saves time with.
-_PREVIEW = {"resolution": 48, "ghost_batch": 16384, "carving_iterations": 0, "refinement_iterations": 0,
-            "iterations": 50, "spp": 4, "primal_spp": 4, "max_depth": 2, "light_height": 16, "triptychs": 4}
+_PREVIEW = {"resolution": 48, "ghost_iterations": 600, "ghost_batch": 16384, "carving_iterations": 0,
+            "refinement_iterations": 0, "iterations": 50, "spp": 4, "primal_spp": 4, "max_depth": 2,
+            "color_hold": 0, "even_start": False, "light_height": 16, "triptychs": 4}
 
 
 @dataclass(frozen=True)
