@@ -14,6 +14,7 @@ from ..extraction.flexicubes import deviation
 from ..extraction.surface_mesh import SurfaceMesh, gather
 from ..light import EnvironmentLight
 from ..material import MaterialField
+from ..means import mean
 from ..scene import FitScene
 from ..views import PinholeViews
 from .config import FitConfig
@@ -146,7 +147,7 @@ class Regularisers:
 
     def _flexicubes_deviation(self) -> mi.Float:
         spread = deviation(self._subject.surface, self._subject.lattice, self._subject.deform)
-        return dr.mean(spread) / self._subject.lattice.spacing
+        return mean(spread) / self._subject.lattice.spacing
 
     # --- material and light
 

@@ -11,6 +11,8 @@ of the triangle, both relative to their present values.
 import drjit as dr
 import mitsuba as mi
 
+from ..means import channel_mean
+
 
 def mis_weight(pdf_a, pdf_b):
     """Power heuristic, without derivatives."""
@@ -109,6 +111,6 @@ def delta_lobe(bsdf, si, ray, ray_next, choice, sample2, delta, active, kind, ch
     d = dr.select(passes, ray.d, dr.select(delta, si.to_world(sample.wo), ray_next.d))
     change = dr.select(passes, dr.relative_grad(transmission),
                        dr.select(delta, dr.relative_grad(weight), change))
-    opacity = 1 - dr.mean(mi.unpolarized_spectrum(transmission))
+    opacity = 1 - channel_mean(mi.unpolarized_spectrum(transmission))
     seen = dr.select(passes, dr.relative_grad(1 - opacity), dr.relative_grad(opacity))
     return d, change, dr.select(active, seen, 1)

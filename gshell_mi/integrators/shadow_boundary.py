@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..means import channel_mean, mean
 from .edge_wedges import build_edge_wedges
 from .reparameterised_film import film_channels
 from .resampling import systematic_counts
@@ -148,11 +149,11 @@ class _Boundary:
         lit, _ = self.curves.rays(drawn, cast, followed, outward)
         radiance = dr.select(ok & self._reaches(drawn, lit, followed.lit), radiance, 0)
         if indirect:
-            radiance = dr.mean(mi.unpolarized_spectrum(radiance))
-            mean = dr.mean(radiance)
-            radiance = mi.Spectrum(radiance + dr.select(mean > 0, _INDIRECT * mean, 1))
+            radiance = channel_mean(mi.unpolarized_spectrum(radiance))
+            typical = mean(radiance)
+            radiance = mi.Spectrum(radiance + dr.select(typical > 0, _INDIRECT * typical, 1))
         _, area, _ = self.curves.film_vectors(followed)
-        value = dr.mean(mi.unpolarized_spectrum(scattered * radiance))
+        value = channel_mean(mi.unpolarized_spectrum(scattered * radiance))
         importance = dr.select(ok, drawn.weight * area * value, 0)
         dr.eval(cast, outward, importance, drawn.weight)
         return cast, outward, importance

@@ -184,8 +184,9 @@ def _visible_rims(scene, sensor, a, b, margin, to_camera, near, cull):
     if dr.width(index) == 0:
         return None
     with dr.resume_grad():
-        return tuple(project_to_film(sensor, mi.Point3f(*(dr.gather(mi.Float, x, index) for x in points)))
-                     for points in (a, b))
+        chosen = (mi.Point3f(*(dr.gather(mi.Float, x, index, mode=SIZE_INDEPENDENT) for x in points))
+                  for points in (a, b))
+        return tuple(project_to_film(sensor, points) for points in chosen)
 
 
 def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True, crease_angle=0.1):

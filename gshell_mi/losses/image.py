@@ -7,7 +7,7 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
-from .reduction import mean, mean_where
+from ..means import mean, mean_where
 
 #: Keeps relative losses finite in the dark: radiance below this counts as this.
 _RELATIVE_FLOOR = 0.01

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..extraction.surface_mesh import gather
-from .reduction import mean
+from ..means import mean
 
 
 def grey_world(radiance: mi.Color3f) -> mi.Float:

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..extraction.surface_mesh import gather
-from .reduction import mean
+from ..means import mean
 
 
 def edge_smoothness(values: mi.Color3f | mi.Float, faces: mi.Vector3u) -> mi.Float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .reduction import mean, mean_where
+from ..means import mean, mean_where
 
 #: How far below or above 0 the regularisers pull ν, in its unit: enough to change the sign.
 EPSILON = 0.03

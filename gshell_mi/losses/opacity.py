@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from .reduction import mean
+from ..means import mean
 
 
 def binary_entropy_bound(alpha) -> mi.Float:

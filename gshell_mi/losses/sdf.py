@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..activations import softplus
 from ..extraction.surface_mesh import gather
 from ..lattice import MISSING, BlockLattice, Lattice
-from .reduction import mean_where
+from ..means import mean_where
 
 
 def sign_cross_entropy(sdf: mi.Float, lattice: Lattice | BlockLattice) -> mi.Float:

@@ -1,4 +1,8 @@
-"""Means that every loss ends with."""
+"""Means whose kernels serve arrays of every size.
+
+``dr.mean`` makes the number of entries part of its kernel, even for the mean of a colour's channels. Meshes
+have other numbers of vertices and edges in every step, and so every step would compile kernels of its own.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +13,8 @@ import mitsuba as mi
 def mean(x) -> mi.Float:
     """Mean over every entry of an array, colour or tensor; 0 if there is none, as of a mesh without faces."""
     flat = dr.ravel(x) if not dr.is_tensor_v(x) else x.array
-    if dr.width(flat) == 0:
-        return mi.Float(0)
-    return dr.mean(flat) if dr.depth_v(flat) == 1 else flat
+    count = dr.width(flat)
+    return dr.sum(flat) / dr.opaque(mi.Float, count) if count else mi.Float(0)
 
 
 def mean_where(chosen: mi.Bool, x: mi.Float) -> mi.Float:
@@ -23,3 +26,13 @@ def mean_where(chosen: mi.Bool, x: mi.Float) -> mi.Float:
     """
     count = dr.sum(dr.select(chosen, mi.Float(1), 0))
     return dr.sum(dr.select(chosen, x, 0)) / dr.maximum(count, 1)
+
+
+def channel_mean(color: mi.Color3f) -> mi.Float:
+    """Mean of the channels, one per lane.
+
+    >>> import mitsuba as mi
+    >>> channel_mean(mi.Color3f(1, 2, 6))[0]
+    3.0
+    """
+    return dr.sum(color) / len(color)
