@@ -21,7 +21,7 @@ _MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "unse
 #: What the detail stage takes of the first steps of the joint stage for material and light.
 _CALMER = 0.3
 
-#: What ``--preview`` saves time with.
+#: What ``--preview`` has instead: less of everything, but for the steps that openings need.
 _PREVIEW = {"resolution": 48, "ghost_iterations": 600, "ghost_batch": 16384, "carving_iterations": 0,
             "refinement_iterations": 0, "iterations": 50, "spp": 4, "primal_spp": 4, "max_depth": 2,
             "color_hold": 0, "even_start": False, "light_height": 16, "triptychs": 4}

@@ -11,6 +11,7 @@ from ..errors import UserError
 from ..fields.smoothing import LatticeDiffusion
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, principled
+from ..means import mean
 from ..parametrisation import StepRules, make_parametrisation
 from ..scene import FitScene
 from ..schedules import decay_at
@@ -119,10 +120,10 @@ class JointStage:
             self._step_material(progress, diffuse)
             self._step_light(progress)
         self._follow_surface(rescan=(iteration + 1) % _RESCAN == 0)
-        error = dr.mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]), axis=None)
+        error = mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]))
         return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
                 **{name: value[0] for name, value in terms.items()},
-                "psnr": -10 * float(np.log10(max(error.array[0], 1e-10)))}
+                "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
 
     def finish(self) -> None:
         """Leaves the last step's parameters in the scene, without what noise has cut out or left floating."""

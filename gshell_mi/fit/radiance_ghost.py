@@ -18,6 +18,7 @@ from .. import losses
 from ..activations import inverse_softplus, sigmoid, softplus
 from ..compat import mesh_scene
 from ..fields.smoothing import MeshDiffusion
+from ..means import mean
 from ..schedules import decay_at
 from ..views import PinholeViews
 from .config import FitConfig
@@ -115,7 +116,7 @@ class RadianceGhost:
         )
         dr.backward(total)
         self.update(("opacity", *SIDES), config.ghost_lr * decay_at(progress))
-        error = dr.mean(dr.ravel(dr.square(dr.detach(radiance) - sample.radiance)))
+        error = mean(dr.square(dr.detach(radiance) - sample.radiance))
         return {"loss": total[0], "image": image[0], "mask": mask[0],
                 "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
 

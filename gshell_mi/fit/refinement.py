@@ -15,6 +15,7 @@ import numpy as np
 
 from .. import losses
 from ..fields.smoothing import MeshDiffusion
+from ..means import mean
 from ..outliers import trusted
 from ..schedules import falling
 from ..triangles import face_areas
@@ -77,7 +78,7 @@ class PhotometricRefinement:
         dr.backward(total)
         self._move(progress, iteration)
         ghost.update(SIDES, config.refinement_radiance_lr)
-        error = dr.mean(dr.ravel(dr.square(dr.detach(radiance) - sample.radiance)))
+        error = mean(dr.square(dr.detach(radiance) - sample.radiance))
         return {"loss": total[0], "image": image[0], "outline": outline[0],
                 "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
 

@@ -184,9 +184,8 @@ def _visible_rims(scene, sensor, a, b, margin, to_camera, near, cull):
     if dr.width(index) == 0:
         return None
     with dr.resume_grad():
-        chosen = (mi.Point3f(*(dr.gather(mi.Float, x, index, mode=SIZE_INDEPENDENT) for x in points))
-                  for points in (a, b))
-        return tuple(project_to_film(sensor, points) for points in chosen)
+        return tuple(project_to_film(sensor, dr.gather(mi.Point3f, points, index, mode=SIZE_INDEPENDENT))
+                     for points in (a, b))
 
 
 def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True, crease_angle=0.1):

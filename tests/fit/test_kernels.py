@@ -13,7 +13,7 @@ from gshell_mi.fit.start import start_light, start_material
 from gshell_mi.lattice import make_lattice
 from gshell_mi.scene import load_fit_scene
 
-#: Every loss of the surface, which changes its size, and those of the material that look it up.
+#: Losses over the surface, whose size changes, that the defaults leave out.
 LOSSES = {"hole_opening": 1e-3, "hole_closing": 1e-3, "sdf_sign": 1e-3, "eikonal": 1e-3,
           "template_smoothness": 1e-3}
 CONFIG = FitConfig(iterations=100, warmup=0, geometry_lr=0.3, spp=2, primal_spp=2, light_height=8,
@@ -37,7 +37,7 @@ def test_a_step_compiles_nothing(bowl_scene, grid, settings):
 
     counts, launched, compiled = set(), 0, []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for step in range(24):
+        for step in range(36):
             dr.kernel_history_clear()
             joint.step(step)
             kernels = dr.kernel_history([dr.KernelType.JIT])
