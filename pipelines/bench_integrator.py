@@ -2,11 +2,12 @@
 
     python pipelines/bench_integrator.py [--faces 4000 80000] [--repeats 12] [--depth 3]
 
-One forward and one reverse pass per repeat, 256² pixels, 16 spp, an open shirt extracted from a lattice with
-about the given number of faces, under an environment. The contestants take turns in one process and the least
-time of each counts: processor time of all threads, which other processes disturb least (the time on the clock
-is shown beside it). "std" is the standard deviation over seeds of the derivative of a weighted sum of the
-image's colours with respect to a translation. ``prb_projective`` runs with sppc = sppp = 16 and sppi = 0.
+One forward and one reverse pass per repeat, 256² pixels by default, 16 spp, an open shirt extracted from a
+lattice with about the given number of faces, under an environment. The contestants take turns in one process
+and the least time of each counts: processor time of all threads, which other processes disturb least (the
+time on the clock is shown beside it). "std" is the standard deviation over seeds of the derivative of a
+weighted sum of the image's colours with respect to a translation. ``prb_projective`` runs with sppc = sppp =
+16 and sppi = 0.
 """
 
 import os
@@ -35,8 +36,8 @@ def shirt(faces):
     cells, count = 32, 0
     for _ in range(3):
         lattice = make_lattice("tet", cells)
-        sdf, msdf = shirt_fields(lattice)
-        mesh = extract(lattice, mi.Float(sdf), mi.Float(msdf))
+        sdf, msdf = shirt_fields(lattice.points(mi.Float))
+        mesh = extract(lattice, sdf, msdf)
         count = mesh.face_count
         cells = max(8, round(cells * np.sqrt(faces / count)))
     v, f = np.array(mesh.vertices).T, np.array(mesh.faces).T
@@ -66,16 +67,16 @@ def step(mover, integrator, seed, weights):
     return time.process_time() - work, time.perf_counter() - start, float(dr.grad(t)[0])
 
 
-def run(faces, depth, repeats):
+def run(faces, resolution, depth, repeats):
     def build(resolution):
         v, f = shirt(faces)
         return (gradient_scenes.load(gradient_scenes.camera(resolution, (1.5, 1.5, 4)), gradient_scenes.sky(),
                                      gradient_scenes.make_mesh("subject", v, f)),
                 gradient_scenes.translation(v, (1, 0, 0)))
 
-    mover = gradient_scenes.Mover(gradient_scenes.GradientScene("shirt", "", build), 256)
+    mover = gradient_scenes.Mover(gradient_scenes.GradientScene("shirt", "", build), resolution)
     count = dr.width(mover.params["subject.faces"]) // 3
-    weights = mi.TensorXf(gradient_scenes.image_weights(256))
+    weights = mi.TensorXf(gradient_scenes.image_weights(resolution))
     integrators = {name: mi.load_dict(options) for name, options in contestants(depth).items()}
     results = {name: [] for name in integrators}
     for seed in range(repeats + 2):
@@ -105,6 +106,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--faces", type=int, nargs="*", default=[4000, 80000],
                         help="approximate numbers of faces (default 4000 80000)")
+    parser.add_argument("--resolution", type=int, default=256, help="pixels per side (default 256)")
     parser.add_argument("--depth", type=int, default=3, help="max_depth (default 3)")
     parser.add_argument("--repeats", type=int, default=12, help="seeds per contestant (default 12)")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default llvm_ad_rgb)")
@@ -112,7 +114,7 @@ def main():
     mi.set_variant(arguments.variant)
     mi.set_log_level(mi.LogLevel.Error)
     for faces in arguments.faces:
-        run(faces, arguments.depth, arguments.repeats)
+        run(faces, arguments.resolution, arguments.depth, arguments.repeats)
 
 
 if __name__ == "__main__":

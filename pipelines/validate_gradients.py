@@ -79,7 +79,7 @@ def red_and_blue(image, scale):
     return np.stack([np.where(x > 0, 1, 1 + x), 1 - np.abs(x), np.where(x < 0, 1, 1 - x)], -1)
 
 
-def measure(case, resolution, seconds, parts):
+def measure(case, resolution, seconds, few_error, parts):
     """Measures parts of a row ("fd", "ours", "stock") and keeps them in ``out/gradients``."""
     mover = gradient_scenes.Mover(case, resolution)
     weights = gradient_scenes.image_weights(resolution)
@@ -125,7 +125,7 @@ def measure(case, resolution, seconds, parts):
 
         many, few = ours(16.0), ours(1.0)
         measured("ours", forward(many, SPP), FINE, seconds)
-        measured("few", forward(few, FEW, 10_000), COARSE, 2 * seconds, least=32)
+        measured("few", forward(few, FEW, 10_000), few_error, 2 * seconds, least=32)
         reverse = gradient_scenes.reverse_derivative(mover, many, SPP, 0, weights)
         row["mismatch"] = abs(reverse - row["ours"][0]) / max(abs(reverse), 1e-9)
     if "stock" in parts:
@@ -245,6 +245,9 @@ def main():
     parser.add_argument("--resolution", type=int, default=64, help="pixels per side (default 64)")
     parser.add_argument("--seconds", type=float, default=25,
                         help="greatest processor time for one figure (default 25)")
+    parser.add_argument("--few-error", type=float, default=COARSE,
+                        help="standard error, as a fraction, that ends the repeats at few samples, which may "
+                        "take twice the time of other figures (default 0.01)")
     parser.add_argument("--parts", nargs="*", choices=PARTS, default=PARTS,
                         help="what to measure anew (default all): finite differences, gshell_path, Mitsuba's "
                         "projective integrators")
@@ -254,7 +257,7 @@ def main():
     mi.set_log_level(mi.LogLevel.Error)
     for case in gradient_scenes.SCENES:
         if not arguments.scenes or case.name in arguments.scenes:
-            measure(case, arguments.resolution, arguments.seconds, arguments.parts)
+            measure(case, arguments.resolution, arguments.seconds, arguments.few_error, arguments.parts)
             print(format_row(recall(case, arguments.resolution)), flush=True)
     measured = [recall(case, arguments.resolution) for case in gradient_scenes.SCENES]
     write_page([kept for kept in measured if kept], arguments.resolution)

@@ -63,7 +63,8 @@ class Bookkeeping:
 
     def iterate(self, stage: str, count: int, worker: Worker, optimizers: Mapping[str, mi.ad.Adam],
                 constants: Mapping[str, np.ndarray],
-                variables: Callable[[], dict[str, np.ndarray]] = dict) -> None:
+                variables: Callable[[], dict[str, np.ndarray]] = dict,
+                stalled: Callable[[int], bool] = lambda done: False) -> None:
         """Runs the steps of a stage that are left, logging each and saving a checkpoint now and then.
 
         Args:
@@ -71,6 +72,7 @@ class Bookkeeping:
             optimizers: their state is saved, and restored where a stage goes on.
             constants: arrays that the checkpoint keeps; those of optimizers, ``name/...``, are left out.
             variables: further arrays, as they are when a checkpoint is saved.
+            stalled: whether the stage ends after so many steps, though some are left.
         """
         first = self.checkpoint.iteration
         if first > 0:
@@ -88,6 +90,8 @@ class Bookkeeping:
         with self.progress.stage(stage, count, first) as advance:
             saved, pause = time.monotonic(), self.checkpoint_seconds
             for iteration in range(first, count):
+                if stalled(iteration):
+                    break
                 begin = time.monotonic()
                 self.interrupt.check()
                 values = {name: float(value) for name, value in worker.step(iteration).items()}

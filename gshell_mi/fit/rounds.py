@@ -16,6 +16,7 @@ from ..scene import FitScene
 from ..views import PinholeViews
 from .bookkeeping import Bookkeeping
 from .config import FitConfig
+from .descent import Descent
 from .ghost_template import GhostTemplate
 from .outlines import Outlines
 from .pixels import PixelPool
@@ -75,7 +76,9 @@ class RefinementRounds:
             self.books.enter("folds", **state)
         else:
             first = self._standing("refinement", state["positions"])
-        second = self._moved("folds", first.positions, config.for_folds(), state)
+        second = self._moved("folds", first.positions, config.for_folds(), state, config.folds_descent)
+        if second is None:
+            return [first]
         return [second, first] if second.error < config.folds_gain * first.error else [first, second]
 
     def _standing(self, stage: str, positions: np.ndarray) -> Moved:
@@ -84,13 +87,21 @@ class RefinementRounds:
         self._ghost.refit_anew(self.template.solid)
         return self._seen(stage, positions)
 
-    def _moved(self, stage: str, positions: np.ndarray, config: FitConfig,
-               state: Mapping[str, np.ndarray]) -> Moved:
-        """The template after a round that starts from ``positions`` and the radiance of now."""
+    def _moved(self, stage: str, positions: np.ndarray, config: FitConfig, state: Mapping[str, np.ndarray],
+               descent: float | None = None) -> Moved | None:
+        """The template after a round that starts from ``positions`` and the radiance of now; None if its
+        image error has not fallen below the fraction ``descent``."""
         refinement = PhotometricRefinement(self._ghost, positions, self.template.faces, self._outlines,
                                            self._cell, config)
-        self.books.iterate(stage, config.refinement_iterations, refinement,
-                           {"ghost": self._ghost.optimizer, "refinement": refinement.optimizer}, state)
+        optimizers = {"ghost": self._ghost.optimizer, "refinement": refinement.optimizer}
+        count = config.refinement_iterations
+        if descent is None:
+            self.books.iterate(stage, count, refinement, optimizers, state)
+        else:
+            watched = Descent(refinement, count, descent, state)
+            self.books.iterate(stage, count, watched, optimizers, state, watched.state, watched.stalled)
+            if watched.stalled(count):
+                return None
         with self.books.timed(stage):
             self._ghost.move(mi.Float(refinement.positions().ravel()))
             self._ghost.refit(self.template.solid)

@@ -294,7 +294,7 @@ class _Fit:
                     break
         facts = self.checkpoint.facts
         facts["refinement_kept"] = taken != "start"
-        if any(moved.stage == "folds" for moved in rounds):
+        if rounds and self.config.folds_iterations:
             facts["folds_kept"] = taken == "folds"
         self.books.enter("joint", **found | self._without_unseen(found), light=state["light"])
 

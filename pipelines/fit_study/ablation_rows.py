@@ -52,7 +52,7 @@ ROWS = [
     *_group("Photometric refinement",
             ("no-refinement", "off", {"refinement_iterations": 0}),
             ("no-folds", "first round only", {"folds_iterations": 0}),
-            ("folds-always", "second round kept unseen", {"folds_gain": _ALWAYS}),
+            ("folds-always", "second round kept unseen", {"folds_descent": _ALWAYS, "folds_gain": _ALWAYS}),
             ("no-sheets", "both sides of every sheet stay", {"sheet_thickness": 0.0}),
             ("unseen-stays", "what no view sees stays", {"unseen_area": 1.0}),
             ("refinement-always", "kept unseen", {"refinement_gain": _ALWAYS}),
