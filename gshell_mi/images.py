@@ -32,7 +32,12 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
     >>> round(psnr(np.zeros(4), np.full(4, 0.1)), 2)
     20.0
     """
-    return float(-10 * np.log10(np.mean((image - reference) ** 2) + 1e-12))
+    return decibels(np.mean((image - reference) ** 2))
+
+
+def decibels(squared_error: float) -> float:
+    """PSNR of a mean squared error of arrays with peak 1; 120 dB if that is 0."""
+    return float(-10 * np.log10(squared_error + 1e-12))
 
 
 def triptych(target: np.ndarray, fit: np.ndarray) -> np.ndarray:

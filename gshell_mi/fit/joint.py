@@ -9,6 +9,7 @@ import numpy as np
 from .. import losses
 from ..errors import UserError
 from ..fields.smoothing import LatticeDiffusion
+from ..images import decibels
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, principled
 from ..means import mean
@@ -123,7 +124,7 @@ class JointStage:
         error = mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]))
         return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
                 **{name: value[0] for name, value in terms.items()},
-                "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
+                "psnr": decibels(error[0])}
 
     def finish(self) -> None:
         """Leaves the last step's parameters in the scene, without what noise has cut out or left floating."""

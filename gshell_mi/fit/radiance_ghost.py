@@ -18,6 +18,7 @@ from .. import losses
 from ..activations import inverse_softplus, sigmoid, softplus
 from ..compat import mesh_scene
 from ..fields.smoothing import MeshDiffusion
+from ..images import decibels
 from ..means import mean
 from ..schedules import decay_at
 from ..views import PinholeViews
@@ -118,7 +119,7 @@ class RadianceGhost:
         self.update(("opacity", *SIDES), config.ghost_lr * decay_at(progress))
         error = mean(dr.square(dr.detach(radiance) - sample.radiance))
         return {"loss": total[0], "image": image[0], "mask": mask[0],
-                "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
+                "psnr": decibels(error[0])}
 
     def refit_anew(self, opaque: np.ndarray) -> None:
         """Fits the radiance as ``refit`` does, but from grey to where errors compare."""

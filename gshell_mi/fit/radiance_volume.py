@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from ..activations import sigmoid, softplus
 from ..compat import mesh_scene
+from ..images import decibels
 from ..views import PinholeViews
 from .config import FitConfig
 from .contrast import Contrast
@@ -105,7 +106,7 @@ class RadianceVolume:
         error = dr.sum(dr.ravel(dr.square(adjoint[0] - target)))
         image, mask = image[0] / count, mask[0] / count
         return {"loss": image + weight * mask, "image": image, "mask": mask,
-                "psnr": -10 * float(np.log10(max(error[0] / (3 * count), 1e-10)))}
+                "psnr": decibels(error[0] / (3 * count))}
 
     def opacity(self) -> np.ndarray:
         """(n + 1, n + 1, n + 1) opacity of one cell's length, in [0, 1]."""

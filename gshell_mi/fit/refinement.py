@@ -15,6 +15,7 @@ import numpy as np
 
 from .. import losses
 from ..fields.smoothing import MeshDiffusion
+from ..images import decibels
 from ..means import mean
 from ..outliers import trusted
 from ..schedules import falling
@@ -80,7 +81,7 @@ class PhotometricRefinement:
         ghost.update(SIDES, config.refinement_radiance_lr)
         error = mean(dr.square(dr.detach(radiance) - sample.radiance))
         return {"loss": total[0], "image": image[0], "outline": outline[0],
-                "psnr": -10 * float(np.log10(max(error[0], 1e-10)))}
+                "psnr": decibels(error[0])}
 
     def positions(self) -> np.ndarray:
         """(V, 3) world positions."""
