@@ -36,7 +36,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from gshell_mi.export.ply import read_ply
-from gshell_mi.fit.checkpoint import Checkpoint
+from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
 
 #: What a fit writes after its last step, in this order.
 ENDING = ("mesh.ply", "template.ply", "light.exr", "scene.xml", "metrics.json", "mesh.glb", "report.html")

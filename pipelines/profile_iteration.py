@@ -28,8 +28,8 @@ _RENDERING = ("render", "render backward")
 def joint_stage(scene: Path, output: Path):
     """The joint stage of a finished fit, as its checkpoint has it."""
     from gshell_mi.fit import FitConfig
-    from gshell_mi.fit.checkpoint import Checkpoint, restore_optimizer
-    from gshell_mi.fit.joint import JointStage
+    from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint, restore_optimizer
+    from gshell_mi.fit.joint.joint import JointStage
     from gshell_mi.fit.start import fit_lattice, start_fields, start_light, start_material
     from gshell_mi.scene import load_fit_scene
 

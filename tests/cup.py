@@ -7,7 +7,7 @@ import trimesh
 
 from gshell_mi.compat import mesh_scene
 from gshell_mi.fit.config import FitConfig
-from gshell_mi.fit.pixels import PixelPool
+from gshell_mi.fit.ghost.pixels import PixelPool
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
 

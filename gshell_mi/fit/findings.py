@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..diagnostics import diagnose
 from ..scene import FitScene
 from ..views import PinholeViews
-from .depth import depth_error
+from .joint.depth import depth_error
 
 
 def findings(fit: FitScene, views: PinholeViews, scene: mi.Scene, warn: Callable[[str], None]) -> dict:

@@ -27,27 +27,28 @@ from ..scene import load_fit_scene
 from ..topology import topology
 from ..triangles import positive_part
 from ..views import PinholeViews
-from .bookkeeping import Bookkeeping, checkpoint_path
-from .carving import carve
-from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
+from .bookkeeping.bookkeeping import Bookkeeping, checkpoint_path
+from .bookkeeping.checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
+from .bookkeeping.interrupt import Interrupt
+from .bookkeeping.observer import Observer
+from .bookkeeping.progress import Progress
+from .carving.carving import carve
+from .carving.radiance_volume import RadianceVolume
 from .config import FitConfig, default_output
-from .depth import check_depth
-from .field_fitting import FieldFitting
+from .cut.recast import recast
+from .cut.spare_sides import Cut, without_spare_sides
+from .cut.unseen import without_unseen
 from .findings import findings
-from .ghost_template import GhostTemplate, closed_template, ghost_template
-from .interrupt import Interrupt
-from .joint import JointStage
-from .justified import close_unjustified, open_unjustified
+from .ghost.ghost_template import GhostTemplate, closed_template, ghost_template
+from .ghost.justified import close_unjustified, open_unjustified
+from .ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice
+from .ghost.pixels import PixelPool
+from .ghost.radiance_ghost import RadianceGhost
+from .joint.depth import check_depth
+from .joint.field_fitting import FieldFitting
+from .joint.joint import JointStage
 from .memory import MemoryEstimate
-from .observer import Observer
-from .opening import clean_opacity, msdf_from_template, splat_to_lattice
-from .pixels import PixelPool
-from .progress import Progress
-from .radiance_ghost import RadianceGhost
-from .radiance_volume import RadianceVolume
-from .recast import recast
-from .rounds import Moved, RefinementRounds
-from .spare_sides import Cut, without_spare_sides
+from .refinement.rounds import Moved, RefinementRounds
 from .start import (
     EARLY_GRIDS,
     TYPICAL_REFLECTANCE,
@@ -58,7 +59,6 @@ from .start import (
     start_light,
     start_material,
 )
-from .unseen import without_unseen
 
 #: What the joint stage starts from.
 _SURFACE = ("sdf", "msdf", "radiance", "known")

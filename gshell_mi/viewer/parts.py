@@ -11,7 +11,7 @@ from ..export.gltf import Part
 from ..report.viewer_model import back_faces
 
 if TYPE_CHECKING:
-    from ..fit.observer import Preview
+    from ..fit import Preview
 
 
 def mesh_parts(preview: Preview) -> list[Part]:

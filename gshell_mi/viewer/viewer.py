@@ -17,7 +17,7 @@ from ..views import PinholeViews
 from .parts import mesh_parts, template_part
 
 if TYPE_CHECKING:
-    from ..fit.observer import Preview
+    from ..fit import Preview
     from ..scene import FitScene
 
 #: Seconds between updates, at least.

@@ -19,7 +19,7 @@ from gshell_mi.errors import UserError
 from gshell_mi.export.fitted_scene import load_scene
 from gshell_mi.files import replacing
 from gshell_mi.fit import FitConfig, fit_scene
-from gshell_mi.fit.checkpoint import Checkpoint
+from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
 from gshell_mi.scene import render_missing_targets
 
 

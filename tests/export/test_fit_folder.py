@@ -17,7 +17,7 @@ from gshell_mi.export.ply import read_ply, write_ply
 from gshell_mi.export.stock_scene import up_axis, write_light, write_scene
 from gshell_mi.fields import LatticeFields, sphere
 from gshell_mi.fit.config import FitConfig
-from gshell_mi.fit.joint import JointStage
+from gshell_mi.fit.joint.joint import JointStage
 from gshell_mi.lattice import TetLattice
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField

@@ -11,8 +11,8 @@ from bowl import CLOSED, RADIUS, SHORT
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
-from gshell_mi.fit.checkpoint import Checkpoint
-from gshell_mi.fit.joint import JointStage
+from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+from gshell_mi.fit.joint.joint import JointStage
 from gshell_mi.fit.start import start_material
 from gshell_mi.lattice import BlockLattice, TetLattice
 from gshell_mi.light import EnvironmentLight
@@ -117,7 +117,7 @@ def test_a_fit_in_blocks_is_resumed(bowl_scene, tmp_path, monkeypatch):
         return step(self, iteration)
 
     # However long it takes to save one.
-    monkeypatch.setattr("gshell_mi.fit.bookkeeping._CHECKPOINT_PAUSE", 0)
+    monkeypatch.setattr("gshell_mi.fit.bookkeeping.bookkeeping._CHECKPOINT_PAUSE", 0)
     monkeypatch.setattr(JointStage, "step", stopped)
     assert main(command) == 130
     monkeypatch.setattr(JointStage, "step", step)

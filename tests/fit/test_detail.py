@@ -11,7 +11,7 @@ from bowl import CLOSED, RADIUS, SHORT
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
-from gshell_mi.fit.joint import JointStage
+from gshell_mi.fit.joint.joint import JointStage
 from gshell_mi.fit.start import start_fields, start_light, start_material
 from gshell_mi.lattice import FlexiCubesLattice
 from gshell_mi.light import EnvironmentLight

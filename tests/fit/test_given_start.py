@@ -8,7 +8,7 @@ from bowl import SHORT, write_fit_scene
 from gshell_mi import TetLattice, make_lattice
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit.__main__ import main
-from gshell_mi.fit.checkpoint import Checkpoint
+from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import given_material
 

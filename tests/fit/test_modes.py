@@ -95,7 +95,7 @@ def test_geometry_only(scene, tmp_path):
 
 def test_geometry_only_shades_faces_flat(scene):
     from gshell_mi.fit import FitConfig
-    from gshell_mi.fit.joint import JointStage
+    from gshell_mi.fit.joint.joint import JointStage
     from gshell_mi.fit.start import start_light, start_material
     loaded = load_fit_scene(scene)
     count = loaded.subject.lattice.vertex_count

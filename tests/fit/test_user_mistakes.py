@@ -15,7 +15,7 @@ from bowl import CLOSED, SHORT, SIZE
 from gshell_mi.errors import UserError
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
-from gshell_mi.fit.checkpoint import Checkpoint
+from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
 
 
 @pytest.fixture
@@ -321,7 +321,7 @@ def test_damaged_checkpoint(told, stopped):
 
 
 def test_checkpoint_of_another_version(told, stopped, monkeypatch):
-    monkeypatch.setattr("gshell_mi.fit.checkpoint.FORMAT", 99)
+    monkeypatch.setattr("gshell_mi.fit.bookkeeping.checkpoint.FORMAT", 99)
     assert "written by another version" in told("--resume")
 
 

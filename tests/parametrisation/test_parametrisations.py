@@ -9,7 +9,7 @@ import pytest
 
 from gshell_mi import CubeLattice, FlexiCubesLattice, TetLattice, UserError, extract
 from gshell_mi.fit import FitConfig
-from gshell_mi.fit.checkpoint import optimizer_arrays, restore_optimizer
+from gshell_mi.fit.bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
 from gshell_mi.parametrisation import PARAMETRISATIONS, StepRules, make_parametrisation, network
 from gshell_mi.parametrisation.parametrisation import touched
 from gshell_mi.topology import topology

@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "pipelines"))
 import profile_iteration
 
 from gshell_mi.fit import FitConfig
-from gshell_mi.fit.joint import JointStage
+from gshell_mi.fit.joint.joint import JointStage
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField
 from gshell_mi.scene import load_fit_scene

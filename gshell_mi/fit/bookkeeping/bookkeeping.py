@@ -1,0 +1,141 @@
+"""What a fit keeps on disk while it runs: its checkpoint, its log, and how long each stage took."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol
+
+import mitsuba as mi
+import numpy as np
+
+from ...files import replacing
+from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
+from .interrupt import Interrupt
+from .observer import Observer, Preview
+from .progress import Progress
+
+#: The stages of a fit, in their order.
+STAGES = ("hull", "ghost", "carving", "refinement", "folds", "field", "joint", "detail", "done")
+
+#: Between two checkpoints at least this many times what writing one takes.
+_CHECKPOINT_PAUSE = 10
+
+
+class Worker(Protocol):
+    """A stage that goes in steps."""
+
+    def step(self, iteration: int) -> Mapping[str, float]:
+        """One step; returns what is logged."""
+
+    def preview(self) -> Preview:
+        """The surface as it is."""
+
+
+class Bookkeeping:
+    """Runs the steps of stages, and writes down where they are.
+
+    Args:
+        output: the fit's folder, which ``checkpoint.npz`` and ``log.jsonl`` are written to.
+        checkpoint: where the fit stands; kept up to date.
+        checkpoint_seconds: least time between two checkpoints within a stage.
+        observer: is told of every step.
+    """
+
+    def __init__(self, output: Path, checkpoint: Checkpoint, checkpoint_seconds: float, progress: Progress,
+                 interrupt: Interrupt, observer: Observer | None):
+        self.checkpoint, self.checkpoint_seconds = checkpoint, checkpoint_seconds
+        self.progress, self.interrupt, self.observer = progress, interrupt, observer
+        self._path, self._log = checkpoint_path(output), output / "log.jsonl"
+
+    def enter(self, stage: str, **arrays: np.ndarray) -> None:
+        """Starts a stage from ``arrays``."""
+        self.checkpoint.stage, self.checkpoint.iteration, self.checkpoint.arrays = stage, 0, arrays
+        self.checkpoint.save(self._path)
+
+    def leave(self) -> None:
+        """The last stage has ended; its arrays stay."""
+        self.checkpoint.stage = STAGES[-1]
+        self.checkpoint.save(self._path)
+
+    def iterate(self, stage: str, count: int, worker: Worker, optimizers: Mapping[str, mi.ad.Adam],
+                constants: Mapping[str, np.ndarray],
+                variables: Callable[[], dict[str, np.ndarray]] = dict,
+                stalled: Callable[[int], bool] = lambda done: False) -> None:
+        """Runs the steps of a stage that are left, logging each and saving a checkpoint now and then.
+
+        Args:
+            count: of steps.
+            optimizers: their state is saved, and restored where a stage goes on.
+            constants: arrays that the checkpoint keeps; those of optimizers, ``name/...``, are left out.
+            variables: further arrays, as they are when a checkpoint is saved.
+            stalled: whether the stage ends after so many steps, though some are left.
+        """
+        first = self.checkpoint.iteration
+        if first > 0:
+            for name, optimizer in optimizers.items():
+                restore_optimizer(name, optimizer, self.checkpoint.arrays)
+        constants = {name: constants[name] for name in constants if "/" not in name}
+
+        def save(done: int) -> None:
+            arrays = constants | variables()
+            for name, optimizer in optimizers.items():
+                arrays |= optimizer_arrays(name, optimizer)
+            self.checkpoint.iteration, self.checkpoint.arrays = done, arrays
+            self.checkpoint.save(self._path)
+
+        with self.progress.stage(stage, count, first) as advance:
+            saved, pause = time.monotonic(), self.checkpoint_seconds
+            for iteration in range(first, count):
+                if stalled(iteration):
+                    break
+                begin = time.monotonic()
+                self.interrupt.check()
+                values = {name: float(value) for name, value in worker.step(iteration).items()}
+                self._write_log(stage, iteration, values, time.monotonic() - begin)
+                advance(values)
+                if self.observer:
+                    self.observer.step(stage, iteration, count, values, worker.preview)
+                self._spent(stage, time.monotonic() - begin)
+                if time.monotonic() - saved > pause:
+                    begin = time.monotonic()
+                    save(iteration + 1)
+                    saved = time.monotonic()
+                    pause = max(self.checkpoint_seconds, _CHECKPOINT_PAUSE * (saved - begin))
+        save(count)
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Counts what is done inside as time of a stage."""
+        begin = time.monotonic()
+        yield
+        self._spent(stage, time.monotonic() - begin)
+
+    def rewind_log(self) -> None:
+        """Drops the lines of steps that a killed run did after its last checkpoint: they are done again."""
+        kept = []
+        if self._log.exists():
+            reached = (STAGES.index(self.checkpoint.stage), self.checkpoint.iteration)
+            for line in self._log.read_text().splitlines(keepends=True):
+                step = json.loads(line) if line.endswith("\n") else None
+                if step and (STAGES.index(step["stage"]), step["iteration"]) < reached:
+                    kept.append(line)
+        with replacing(self._log) as partial:
+            partial.write_text("".join(kept))
+
+    def _spent(self, stage: str, seconds: float) -> None:
+        self.checkpoint.seconds[stage] = round(self.checkpoint.seconds.get(stage, 0.0) + seconds, 3)
+
+    def _write_log(self, stage: str, iteration: int, values: dict[str, float], seconds: float) -> None:
+        rounded = {name: float(f"{value:.6g}") for name, value in values.items()}
+        with open(self._log, "a") as log:
+            log.write(json.dumps({"stage": stage, "iteration": iteration, **rounded,
+                                  "seconds": round(seconds, 4)}) + "\n")
+
+
+def checkpoint_path(output: Path) -> Path:
+    """Where the checkpoint of a fit lies in its folder."""
+    return output / "checkpoint.npz"

@@ -1,0 +1,1 @@
+"""A fog of radiance inside the hull: finds what the hull bridges."""

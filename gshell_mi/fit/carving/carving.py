@@ -1,0 +1,152 @@
+"""Carving: the template is hollowed out where that explains views better that nothing was fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import ndimage
+
+from ... import losses
+from ...lattice import Lattice
+from ...topology import topology
+from ...triangles import positive_part
+from ..ghost.ghost_template import GhostTemplate, ghost_template
+from ..ghost.justified import close_unjustified
+from ..ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
+from ..ghost.pixels import PixelPool
+from ..ghost.radiance_ghost import RadianceGhost
+from .hollows import SEEN, hollows
+from .radiance_volume import RadianceVolume
+
+#: A hollow is kept if the error of rays that see into it falls below this fraction.
+_GAIN = 0.95
+
+#: Rays see into a hollow if they go this much farther than to the hull, in cells.
+_DEEPER = 0.7
+
+#: Space is empty below this opacity of a cell.
+_EMPTY = 0.3
+
+#: Logit of a vertex that is taken to be open (its negative).
+_CERTAIN = 3.0
+
+#: Batches of rays that judge.
+_ERROR_STEPS = 20
+
+
+def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, volume: RadianceVolume,
+          known: PixelPool, unknown: PixelPool) -> dict[str, np.ndarray] | None:
+    """Hollows out a template as far as unseen views are explained better.
+
+    Args:
+        subject: the gshell shape; it is left with other fields.
+        state: ``sdf``, ``hull`` and ``msdf`` on the lattice.
+        lattice: whose vertices make a cube.
+        volume: trained.
+        known, unknown: pixels to fit the radiance of both templates to, and those that judge them.
+
+    Returns:
+        ``sdf``, ``hull``, ``msdf``, ``radiance`` (n, 3) and ``known`` (n,) on the lattice; None if there is
+        no hollow, none helps, or the surface would get other boundary loops.
+    """
+    shape = (lattice.stride,) * 3
+    opacity, seen = volume.opacity(), volume.seen()
+    distance = hollows(*(state[name].reshape(shape) / lattice.spacing for name in ("hull", "msdf")),
+                       opacity, seen)
+    if distance is None:
+        return None
+    carved = _carved(state, distance, lattice.spacing)
+    if not (carved["sdf"] < 0).any():
+        return None
+    before = ghost_template(subject, state, lattice)
+    after = ghost_template(subject, carved, lattice, like=before)
+    label, count = ndimage.label(distance > 0, np.ones((3, 3, 3)))
+    label = np.where(label, label, ndimage.maximum_filter(label, size=3))
+    ghosts = [_fitted(template, volume, known) for template in (before, after)]
+    errors = _errors_in_hollows(*ghosts, label, count, volume, unknown, lattice.spacing)
+    kept = errors[1] < _GAIN * errors[0]
+    if not kept[1:].any():
+        return None
+    if not kept[1:].all():
+        # Vertices beside a hollow belong to it.
+        owner = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+        distance = np.where(kept[label[tuple(owner)]], distance, -np.inf)
+        carved = _carved(state, distance, lattice.spacing)
+        after = ghost_template(subject, carved, lattice, like=before)
+        ghosts[1] = _fitted(after, volume, known)
+    clean = partial(clean_opacity, vertices=after.vertices, faces=after.faces,
+                    min_area=volume.config.ghost_min_area)
+    cleaned = clean(after.logits)
+    was, became = (topology(*positive_part(template.vertices, template.faces, logits))
+                   for template, logits in ((before, before.logits), (after, cleaned)))
+    if became.boundary_loops != was.boundary_loops or became.components > was.components:
+        return None
+    if not volume.config.watertight:
+        # Now that what lies behind is in its place, the images may justify more openings.
+        proposed = clean(np.where(_in_empty_space(after, volume, opacity, seen), -_CERTAIN, cleaned))
+        ghost = RadianceGhost(after.start, after.faces, volume.views, known, volume.config)
+        ghost.refit_anew(proposed > 0)
+        cleaned = clean(close_unjustified(proposed, after.faces, ghost.image_error, volume.config.ghost_gain))
+    radiance, found = splat_to_lattice(mi.Float(ghosts[1].radiance()[0].ravel()), after.mesh, lattice)
+    msdf = without_specks(msdf_from_template(cleaned, after.mesh, lattice), after.mesh, lattice,
+                          volume.config.ghost_min_area)
+    return carved | {"msdf": msdf.numpy(), "radiance": radiance.numpy().reshape(-1, 3),
+                     "known": found.numpy()}
+
+
+def _carved(state: Mapping[str, np.ndarray], distance: np.ndarray, spacing: float) -> dict[str, np.ndarray]:
+    fields = {name: np.maximum(state[name], spacing * distance.ravel()).astype(np.float32)
+              for name in ("sdf", "hull")}
+    return fields | {"msdf": state["msdf"]}
+
+
+def _in_empty_space(template: GhostTemplate, volume: RadianceVolume, opacity: np.ndarray,
+                    seen: np.ndarray) -> np.ndarray:
+    """(V,) whether there is nothing within a cell of a vertex, and it is seen."""
+    local = volume.to_lattice @ mi.Point3f(np.ascontiguousarray(template.vertices.T, np.float32))
+    index = ((local + 1) * (0.5 * volume.resolution)).numpy()[::-1]
+    around = ndimage.gaussian_filter(opacity, 1.0)
+    return ((ndimage.map_coordinates(around, index, order=1) < _EMPTY)
+            & (ndimage.map_coordinates(seen, index, order=1) > SEEN))
+
+
+def _fitted(template: GhostTemplate, volume: RadianceVolume, pixels: PixelPool) -> RadianceGhost:
+    ghost = RadianceGhost(template.start, template.faces, volume.views, pixels, volume.config, glossy=True)
+    ghost.refit_anew(template.solid)
+    return ghost
+
+
+def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.ndarray, count: int,
+                       volume: RadianceVolume, pixels: PixelPool, spacing: float) -> np.ndarray:
+    """(2, count + 1) sums of both ghosts' errors over rays that see into each hollow, or through it.
+
+    Rays that find nothing any more count by where they enter, and by their coverage: a hollow must leave the
+    masks as they are. One that no ray sees into has no errors, hence no gain.
+    """
+    labels, side = mi.UInt32(label.ravel().astype(np.uint32)), dr.opaque(mi.UInt32, len(label))
+    sums = [dr.zeros(mi.Float, count + 1) for _ in range(2)]
+    config = volume.config
+    coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0))
+    with dr.suspend_grad():
+        for step in range(_ERROR_STEPS):
+            sample = pixels.sample(config.ghost_batch, seed=config.seed, step=step)
+            ray = volume.views.rays(sample.view, sample.film)
+            near, far = (ghost.scene.ray_intersect_preliminary(ray, coherent=False)
+                         for ghost in (before, after))
+            start = volume.to_lattice @ ray(near.t)
+            through = near.is_valid() & ~far.is_valid()
+            end = dr.select(through, start, volume.to_lattice @ ray(far.t))
+            deeper = through | far.is_valid() & (dr.norm(end - start) > _DEEPER * spacing)
+            x, y, z = mi.Vector3u(dr.clip(dr.round((end + 1) / spacing), 0, mi.Float(side - 1)))
+            hollow = dr.gather(mi.UInt32, labels, x + side * (y + side * z), deeper)
+            for ghost, total in zip((before, after), sums, strict=True):
+                radiance, alpha = ghost.composite(ghost.sheets(ray), ray.d)
+                error = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
+                error = error.x + error.y + error.z + coverage * dr.abs(alpha - sample.alpha)
+                dr.scatter_reduce(dr.ReduceOp.Add, total, error, hollow, deeper)
+            dr.eval(sums)
+    return np.stack([total.numpy() for total in sums])

@@ -1,0 +1,47 @@
+"""Opens what no view sees: of the underside of a seat that is photographed from above, nothing is known."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...fields import LatticeFields
+from ...fields.smoothing import MeshDiffusion
+from ...triangles import area_vectors, unit
+from ...views import PinholeViews
+from ...visibility import best_view
+from ..ghost.opening import also_opened, clean_opacity, rewritten
+
+#: What is seen at this cosine or less is as good as unseen: a hull ends in surfaces that views only graze.
+_GRAZING = 0.2
+
+#: Lambda that smooths the new rims along the template.
+_SMOOTHING = 3.0
+
+
+def without_unseen(subject: mi.Shape, fields: LatticeFields, views: PinholeViews,
+                   min_area: float) -> mi.Float | None:
+    """The mSDF that also cuts away what no view sees from either side; None if that is little.
+
+    Args:
+        subject: the gshell shape; it is left with the fields.
+        fields: of the surface.
+        views: the cameras.
+        min_area: what is connected and smaller than this fraction of the template's area stays: between
+            views, and in folds, there is always something that none of them sees.
+    """
+    subject.set_fields(fields)
+    template, (vertices, faces, _) = subject.template(), subject.surface.to_numpy()
+    places, cells, _ = template.to_numpy()
+    values = template.interpolate(subject.msdf).numpy()
+    centers, normals = places[cells].mean(axis=1), unit(area_vectors(places, cells))
+    known = np.zeros(len(places), bool)
+    known[cells[best_view(centers, normals, (vertices, faces), views) > _GRAZING]] = True
+    # Patches of less than the area flip back.
+    unseen = clean_opacity(np.where((values > 0) & ~known, -1.0, 1.0), places, cells, min_area) < 0
+    if not unseen.any():
+        return None
+    smooth = MeshDiffusion(cells, len(places), _SMOOTHING)
+    cut, near = also_opened(values, unseen, smooth, subject.lattice.spacing)
+    return rewritten(dr.detach(subject.msdf), cut, near, template, subject.lattice)

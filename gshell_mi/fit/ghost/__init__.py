@@ -1,0 +1,1 @@
+"""Radiance without light or material: finds the openings of the hull."""

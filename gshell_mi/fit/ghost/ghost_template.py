@@ -1,0 +1,80 @@
+"""The template that the stages between hull and joint stage work on, and what of it is surface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...extraction.surface_mesh import SurfaceMesh
+from ...fields import LatticeFields
+from ...fields.thin_parts import back_on_solid
+from ...lattice import Lattice
+
+#: A template takes its opacity from another one that is at most this many cells away ...
+_REACH = 1.5
+
+#: ... and has this logit elsewhere.
+_CERTAIN = 3.0
+
+
+@dataclass(frozen=True)
+class GhostTemplate:
+    """A watertight mesh with an opacity.
+
+    Attributes:
+        mesh: as extracted, with its stencil.
+        vertices: (V, 3) its vertices, world units.
+        faces: (F, 3), oriented outwards.
+        logits: (V,) surface where positive, open elsewhere.
+        start: (V, 3) where the vertices were before thin parts were grown.
+    """
+
+    mesh: SurfaceMesh
+    vertices: np.ndarray
+    faces: np.ndarray
+    logits: np.ndarray
+    start: np.ndarray
+
+    @property
+    def solid(self) -> np.ndarray:
+        """(V,) whether a vertex belongs to the surface."""
+        return self.logits > 0
+
+
+def closed_template(subject: mi.Shape, sdf: np.ndarray,
+                    lattice: Lattice) -> tuple[SurfaceMesh, np.ndarray, np.ndarray]:
+    """The template that is where ``sdf`` changes sign, its vertices (V, 3) and its faces (F, 3).
+
+    Args:
+        subject: the gshell shape; it is left with this field, closed, whatever it had before.
+        sdf: at the vertices of ``lattice``.
+        lattice: need not be the shape's own.
+    """
+    subject.set_fields(LatticeFields.closed(sdf, lattice.grid))
+    mesh = subject.template()
+    vertices, faces, _ = mesh.to_numpy()
+    return mesh, vertices, faces
+
+
+def ghost_template(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, *,
+                   like: GhostTemplate | None = None) -> GhostTemplate:
+    """Extracts a template from lattice fields.
+
+    Args:
+        subject: the gshell shape; it is left with these fields, as of ``closed_template``.
+        lattice: of the fields.
+        state: ``sdf``, ``hull`` (the sdf before thin parts were grown) and ``msdf``.
+        like: a template before a change of shape, whose opacity the new one takes over. New parts are solid.
+    """
+    mesh, vertices, faces = closed_template(subject, state["sdf"], lattice)
+    logits, excess = (mesh.interpolate(mi.Float(state[name])).numpy() for name in ("msdf", "hull"))
+    logits = logits / lattice.spacing
+    if like is not None:
+        distance, nearest = cKDTree(like.vertices).query(vertices)
+        logits = np.where(distance < _REACH * subject.cell_size, like.logits[nearest], _CERTAIN)
+    start = back_on_solid(vertices, faces, np.where(logits > 0, subject.length_scale * excess, 0))
+    return GhostTemplate(mesh, vertices, faces, logits, start)

@@ -1,0 +1,1 @@
+"""The joint stage: geometry, material and light by path tracing."""

@@ -1,0 +1,219 @@
+"""The joint stage: geometry, material and light by differentiable path tracing."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ... import losses
+from ...errors import UserError
+from ...fields.smoothing import LatticeDiffusion
+from ...images import decibels
+from ...light import EnvironmentLight
+from ...material import GivenMaterial, MaterialField, principled
+from ...means import mean
+from ...parametrisation import StepRules, make_parametrisation
+from ...scene import FitScene
+from ...schedules import decay_at
+from ...timing import phase
+from ..bookkeeping.observer import Preview
+from ..config import FitConfig
+from ..ghost.opening import without_specks
+from .regularisers import Regularisers
+from .tempered_adam import TemperedAdam
+
+#: Between the first sampler seeds of fits whose seeds are neighbours: no step shares its samples.
+_SEEDS_APART = 1 << 20
+
+#: Steps after which blocks that the surface has left are dropped.
+_RESCAN = 50
+
+
+class JointStage:
+    """Adam on what parametrises the lattice fields, the material and the environment map.
+
+    The subject's shape holds the starting geometry. For the first part of the stage only material and
+    light move: geometry gradients mean nothing while the shading is wrong. If both are given, there is no
+    such part. Where both are sought, the base colour's steps grow slowly: an image knows their product only,
+    and what colours have taken up of the shading the light never gets back. Roughness and metallic do not
+    wait: while they do, a light that is mirrored is sought as if it fell on plaster.
+
+    Args:
+        fit: the scene with its targets.
+        material: a ``GivenMaterial`` stays as it is.
+        light: None keeps the scene's.
+        config: settings of the stage.
+    """
+
+    def __init__(self, fit: FitScene, material: MaterialField | GivenMaterial, light: EnvironmentLight | None,
+                 config: FitConfig):
+        self.fit, self.material, self.light, self.config = fit, material, light, config
+        self.subject = fit.subject
+        self.subject.set_bsdf(mi.load_dict(principled()))
+        for name, field in material.values().items():
+            self.subject.attach_attribute(name, field)
+        self.scene = optimised_scene(fit, light)
+        self.parameters = mi.traverse(self.scene)
+        self._targets = [mi.TensorXf(target.rgba) for target in fit.targets]
+        self._sees_masks = all(target.has_alpha for target in fit.targets) and not config.geometry_only
+        if config.geometry_only:
+            self.subject.shade_flat()
+        self._integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
+                                         "reparam_depth": config.reparam_depth, "hide_emitters": True})
+        resting = {"msdf"} if config.watertight else set()
+        if not config.flexicubes_weights:
+            resting.add("weights")
+        moving = [name for name in self.subject.field_names if name not in resting]
+        start = {name: self.parameters[f"subject.{name}"] for name in moving}
+        rules = StepRules(config.geometry_lr, config.deform_lr, config.geometry_smoothing,
+                          config.geometry_detail)
+        self.geometry = make_parametrisation(config.field, start, self.subject.lattice, rules,
+                                             seed=config.seed)
+        #: The lattice fields of the present step, with gradients enabled; none before the geometry moves.
+        self.fields: dict[str, mi.Float] = {}
+        self.material_optimizer = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
+        # What a mean over all pixels says of one texel may be smaller than the epsilon that is usual.
+        self.light_optimizer = TemperedAdam(lr=config.light_lr, epsilon=1e-12,
+                                            params={"log_radiance": light.log_radiance} if light else None)
+        self._regularisers = Regularisers(fit, self.scene, material if material.parameters else None, light,
+                                          config)
+
+    @property
+    def optimizers(self) -> dict[str, mi.ad.Adam]:
+        return self.geometry.optimizers | {"material": self.material_optimizer, "light": self.light_optimizer}
+
+    def step(self, iteration: int) -> dict[str, float]:
+        """One step on one view; returns the losses.
+
+        Raises:
+            UserError: the steps before have left no surface.
+        """
+        config = self.config
+        given = not (self.material_optimizer.state or self.light_optimizer.state)
+        moving = given or iteration >= config.warmup * config.iterations
+        with phase("scene update"):
+            self._apply(geometry=moving)
+        index = self._view(iteration)
+        seed = (config.seed * _SEEDS_APART + 2 * iteration) % 2**32
+        with phase("render") as compute:
+            image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[index],
+                              integrator=self._integrator, spp=config.primal_spp, spp_grad=config.spp,
+                              seed=seed, seed_grad=seed + 1)
+            compute(image)
+        target = self._targets[index]
+        with phase("losses") as compute:
+            color = losses.IMAGE_LOSSES[config.image_loss](image[..., :3], target[..., :3])
+            mask = losses.mask_l2(image[..., 3], target[..., 3]) if self._sees_masks else mi.Float(0)
+            regularisation, terms = self._regularisers(index)
+            total = color + config.joint_mask * mask + regularisation
+            compute(total)
+        with phase("backward") as compute:
+            dr.backward(total)
+            sought = (self.fields, self.material_optimizer, self.light_optimizer)
+            compute(*(dr.grad(value) for values in sought for value in values.values()))
+        progress = iteration / max(config.iterations, 1)
+        with phase("optimiser"):
+            diffuse = LatticeDiffusion(self.subject.lattice, cells=self.subject.surface.cells)
+            if moving:
+                gradients = {name: dr.grad(field) for name, field in self.fields.items()}
+                self.geometry.step(gradients, progress, iteration, diffuse)
+            self._step_material(progress, diffuse)
+            self._step_light(progress)
+        self._follow_surface(rescan=(iteration + 1) % _RESCAN == 0)
+        error = mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]))
+        return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
+                **{name: value[0] for name, value in terms.items()},
+                "psnr": decibels(error[0])}
+
+    def finish(self) -> None:
+        """Leaves the last step's parameters in the scene, without what noise has cut out or left floating."""
+        self._apply(geometry=True)
+        subject = self.subject
+        self.parameters["subject.msdf"] = without_specks(subject.msdf, subject.template(), subject.lattice,
+                                                         self.config.ghost_min_area)
+        self.parameters.update()
+
+    def outcome(self) -> dict[str, np.ndarray]:
+        """What a stage on a finer lattice starts from, as host arrays, after ``finish``."""
+        fields = self.subject.fields()
+        arrays = {"sdf": fields.sdf, "msdf": fields.msdf, "deform": fields.deform}
+        arrays |= {name: field.numpy() for name, field in self.material.parameters.items()}
+        return arrays | ({"log_radiance": self.light.log_radiance.numpy()} if self.light else {})
+
+    def preview(self) -> Preview:
+        """The mesh of the last step in its base colour."""
+        surface = self.subject.surface
+        with dr.suspend_grad():
+            colors = surface.interpolate(self.material.values()["vertex_color"], 3).numpy().T
+            template_vertices, template_faces, _ = self.subject.template().to_numpy()
+        vertices, faces, _ = surface.to_numpy()
+        return Preview(vertices, faces, colors, template_vertices, template_faces)
+
+    def _view(self, iteration: int) -> int:
+        """Every view once per round, in an order that depends on seed and round alone."""
+        count = len(self.fit.sensors)
+        order = np.random.default_rng((self.config.seed, iteration // count)).permutation(count)
+        return int(order[iteration % count])
+
+    def _apply(self, *, geometry: bool) -> None:
+        """Puts the optimised fields into the scene, with gradients enabled."""
+        if geometry:
+            self.fields = self.geometry.fields()
+            dr.enable_grad(self.fields)
+            for name, field in self.fields.items():
+                self.parameters[f"subject.{name}"] = field
+        self.material.parameters = {name: self.material_optimizer[name] for name in self.material.parameters}
+        for name, field in self.material.values().items():
+            self.parameters[f"subject.lattice_{name}"] = field
+        if self.light:
+            self.light.log_radiance = self.light_optimizer["log_radiance"]
+            self.light.update(self.parameters)
+        self.parameters.update()
+        if self.subject.surface.is_empty:
+            raise UserError("The joint stage has left no surface; start again with --overwrite and a smaller "
+                            "--geometry-lr, or less weight on what opens it (--hole-opening, "
+                            "--visible-outside).")
+
+    def _follow_surface(self, *, rescan: bool) -> None:
+        """Moves the blocks that the fields are stored in, and all that is stored with them."""
+        carried = self.subject.follow(rescan=rescan)
+        if carried is None:
+            return
+        self.geometry.carry(carried)
+        carried.optimizer(self.material_optimizer, self.material.on_lattice)
+        self.material.carry(carried)
+
+    def _step_material(self, progress: float, diffuse: LatticeDiffusion) -> None:
+        config, optimizer = self.config, self.material_optimizer
+        if not optimizer.state:
+            return
+        for name in self.material.on_lattice:
+            gradient = dr.grad(optimizer[name])
+            dr.set_grad(optimizer[name], diffuse(gradient, config.material_gradient_smoothing))
+        rates = dict.fromkeys(optimizer.keys(), decay_at(progress) * config.material_lr)
+        if self.light and progress < config.color_hold:
+            rates["vertex_color"] *= (progress / config.color_hold) ** 2
+        optimizer.set_learning_rate(rates)
+        optimizer.step()
+
+    def _step_light(self, progress: float) -> None:
+        optimizer = self.light_optimizer
+        if not optimizer.state:
+            return
+        gradient = dr.grad(optimizer["log_radiance"])
+        dr.set_grad(optimizer["log_radiance"], gradient / self.light.solid_angles)
+        optimizer.set_learning_rate(decay_at(progress) * self.config.light_lr)
+        optimizer.step()
+
+
+def optimised_scene(fit: FitScene, light: EnvironmentLight | None) -> mi.Scene:
+    """The fit scene with the light to optimise in place of its own, and without its sensors."""
+    objects = {"type": "scene", "subject": fit.subject, "light": light.emitter() if light else fit.light}
+    for index, shape in enumerate(fit.scene.shapes()):
+        if shape is not fit.subject:
+            objects[f"shape_{index}"] = shape
+    for index, emitter in enumerate(fit.scene.emitters()):
+        if emitter.id() != "light" and not emitter.is_environment() and not emitter.shape():
+            objects[f"emitter_{index}"] = emitter
+    return mi.load_dict(objects)

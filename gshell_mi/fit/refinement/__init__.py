@@ -1,0 +1,1 @@
+"""Moves the template to where one radiance explains all images."""

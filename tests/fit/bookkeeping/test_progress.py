@@ -1,0 +1,30 @@
+import re
+
+import pytest
+
+from gshell_mi.fit.bookkeeping import progress as module
+from gshell_mi.fit.bookkeeping.progress import Progress, usual_duration
+
+
+def test_the_longest_step_does_not_count():
+    assert usual_duration([30.0, 1.0, 2.0, 3.0]) == 2.0
+    assert usual_duration([2.0, 2.0]) == 2.0
+
+
+def test_time_left_after_a_first_step_that_compiles(monkeypatch: pytest.MonkeyPatch):
+    now = [0.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    progress = Progress(quiet=True)
+
+    def detail() -> str:
+        return progress._bars.tasks[-1].fields["detail"]
+
+    with progress.stage("joint", 100) as advance:
+        now[0] += 60
+        advance({"loss": 0.5, "psnr": 20.0})
+        assert detail() == "loss 0.5000  PSNR 20.0 dB  1/100"
+        for _ in range(9):
+            now[0] += 0.5
+            advance()
+        assert re.fullmatch(r"10/100  0\.50 s/step  0:45 left", detail())
+    assert detail() == "64.5 s"

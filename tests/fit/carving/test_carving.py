@@ -1,0 +1,101 @@
+"""Carving a cup out of the block that is its hull; and leaving a block, or what has other loops, alone."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from cup import CONFIG, HALF, capture, cup, hull_of, solid_block
+from scipy.spatial import cKDTree
+
+from gshell_mi.fit.carving import carving
+from gshell_mi.fit.carving.carving import carve
+from gshell_mi.fit.carving.radiance_volume import RadianceVolume
+from gshell_mi.fit.ghost.ghost_template import ghost_template
+from gshell_mi.fit.ghost.pixels import PixelPool
+from gshell_mi.lattice import make_lattice
+
+RESOLUTION = 32
+CELL = 2 / RESOLUTION
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """A function that carves the hull of a shape."""
+    subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
+    hull, vertices, faces = hull_of(RESOLUTION)
+    field = hull.ravel().astype(np.float32)
+    state = {"sdf": field, "hull": field, "msdf": np.ones_like(field)}
+    volumes = {}
+
+    def run(shape):
+        if shape not in volumes:
+            views, _, targets = capture(shape())
+            held_out = np.arange(len(views)) % 6 == 0
+            known, unknown = (PixelPool(views, targets, np.flatnonzero(chosen))
+                              for chosen in (~held_out, held_out))
+            volume = RadianceVolume(hull, vertices, faces, subject.to_world, views, known, CONFIG)
+            for step in range(CONFIG.carving_iterations):
+                volume.step(step)
+            volumes[shape] = volume, known, unknown
+        return subject, state, carve(subject, state, subject.lattice, *volumes[shape])
+
+    return run
+
+
+def test_a_cup_is_found(trained):
+    subject, state, carved = trained(cup)
+    sdf = carved["sdf"].reshape((RESOLUTION + 1,) * 3)
+    centre, half_depth = RESOLUTION // 2, round(0.5 * HALF / CELL)
+    assert sdf[centre, centre + half_depth, centre] > 0 > sdf[centre, centre - half_depth, centre]
+    found = ghost_template(subject, carved, subject.lattice)
+    inner = np.abs(found.start).max(axis=1) < HALF - 0.25 * CELL
+    truth, _ = trimesh.sample.sample_surface(cup(), 40000, seed=1)
+    distance = cKDTree(truth).query(found.start[inner])[0]
+    assert inner.sum() > 300 and np.median(distance) < 0.7 * CELL
+    np.testing.assert_array_equal(carved["hull"], np.maximum(carved["hull"], state["hull"]))
+
+
+def test_a_block_stays(trained):
+    assert trained(solid_block)[2] is None
+
+
+def test_hollows_have_to_be_justified(trained, monkeypatch):
+    monkeypatch.setattr(carving, "_GAIN", 0.0)
+    assert trained(cup)[2] is None
+
+
+def test_new_parts_are_solid_and_old_ones_keep_their_opacity():
+    subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
+    hull, _, _ = hull_of(RESOLUTION)
+    field = hull.ravel().astype(np.float32)
+    z = np.repeat(np.linspace(-1, 1, RESOLUTION + 1), (RESOLUTION + 1) ** 2).astype(np.float32)
+    state = {"sdf": field, "hull": field, "msdf": z * CELL}
+    before = ghost_template(subject, state, subject.lattice)
+    hole = 0.3 - np.linalg.norm(subject.lattice.vertex_positions(), axis=1)
+    carved = state | {"sdf": np.maximum(field, hole).astype(np.float32)}
+    after = ghost_template(subject, carved, subject.lattice, like=before)
+    inner = np.abs(after.vertices).max(axis=1) < 0.45
+    assert inner.any() and after.solid[inner].all()
+    np.testing.assert_array_equal(after.solid[~inner], after.vertices[~inner, 2] > 0)
+
+
+def test_the_shape_may_have_had_another_lattice():
+    """As that of a fit with --grid or --resolution has that is resumed: it comes from the scene's file."""
+    subject = mi.load_dict({"type": "gshell", "resolution": 12})
+    lattice = make_lattice("cube", RESOLUTION)
+    field = hull_of(RESOLUTION)[0].ravel().astype(np.float32)
+    state = {"sdf": field, "hull": field, "msdf": np.full_like(field, 2 * CELL)}
+    found = ghost_template(subject, state, lattice)
+    assert subject.lattice == lattice
+    np.testing.assert_allclose(found.logits, 2, rtol=1e-5)
+
+
+def test_a_hollow_may_not_eat_into_a_silhouette(trained, monkeypatch):
+    """The block carved to the ball inside it: what is gone between them would be sky."""
+    axis = np.linspace(-1, 1, RESOLUTION + 1)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    outside_of_ball = (np.sqrt(x**2 + y**2 + z**2) - HALF) / CELL
+    monkeypatch.setattr(carving, "hollows", lambda *_: outside_of_ball)
+    # The patterns alone, where there still is something, are off by a factor of six.
+    monkeypatch.setattr(carving, "_GAIN", 10.0)
+    assert trained(solid_block)[2] is None
