@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 
 import drjit as dr
@@ -74,19 +75,42 @@ class LatticeDiffusion:
             field: ``Float`` with one value per vertex, or three: (r0, g0, b0, r1, ...).
             smoothing: lambda; 0 returns the field as it is.
         """
-        if smoothing == 0:
-            return field
-        # Three channels at once take little more than half the time of one after the other.
-        kind = mi.Vector3f if dr.width(field) == 3 * self._count else mi.Float
+        return self.together({"": field}, smoothing)[""]
+
+    def together(self, fields: Mapping[str, mi.Float], smoothing: float) -> dict[str, mi.Float]:
+        """The same of several fields at once, which is faster than one after the other."""
+        if smoothing == 0 or (self._vertices is not None and dr.width(self._vertices) == 0):
+            return dict(fields)
+        columns = [column for field in fields.values() for column in self._columns(field)]
+        diffused = []
+        # Four values that lie side by side are gathered in twice the time of one, three in five times.
+        while columns:
+            group, columns = columns[:4], columns[4:]
+            kind = {1: mi.Float, 2: mi.Vector2f}.get(len(group), mi.Vector4f)
+            padded = group + [mi.Float(0)] * (kind is mi.Vector4f and 4 - len(group))
+            solution = self._diffused(kind, dr.ravel(kind(*padded)), smoothing)
+            diffused += [solution] if kind is mi.Float else list(dr.unravel(kind, solution))[:len(group)]
+        found = iter(diffused)
+        return {name: self._with_columns(field, [next(found) for _ in self._columns(field)])
+                for name, field in fields.items()}
+
+    def _columns(self, field: mi.Float) -> list[mi.Float]:
+        """The channels of a field at the vertices that are diffused."""
+        kind = self._kind(field)
+        values = dr.unravel(kind, field) if self._vertices is None else dr.gather(kind, field, self._vertices)
+        return [values] if kind is mi.Float else list(values)
+
+    def _with_columns(self, field: mi.Float, columns: list[mi.Float]) -> mi.Float:
+        """A field whose channels are ``columns`` at the vertices that are diffused."""
+        values = self._kind(field)(*columns)
         if self._vertices is None:
-            return self._diffused(kind, field, smoothing)
-        if dr.width(self._vertices) == 0:
-            return field
-        near = dr.ravel(dr.gather(kind, field, self._vertices))
-        diffused = mi.Float(field)
-        dr.scatter(diffused, dr.unravel(kind, self._diffused(kind, near, smoothing)), self._vertices,
-                   mode=dr.ReduceMode.Permute)
-        return diffused
+            return dr.ravel(values)
+        whole = mi.Float(field)
+        dr.scatter(whole, values, self._vertices, mode=dr.ReduceMode.Permute)
+        return whole
+
+    def _kind(self, field: mi.Float) -> type:
+        return mi.Vector3f if dr.width(field) == 3 * self._count else mi.Float
 
     def _diffused(self, kind: type, field: mi.Float, smoothing: float) -> mi.Float:
         known, weight = dr.unravel(kind, field), dr.opaque(mi.Float, smoothing)

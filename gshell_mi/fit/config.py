@@ -23,7 +23,7 @@ _CALMER = 0.3
 
 #: What ``--preview`` has instead: less of everything, but for the steps that openings need.
 _PREVIEW = {"resolution": 48, "ghost_iterations": 600, "ghost_batch": 16384, "carving_iterations": 0,
-            "refinement_iterations": 0, "iterations": 50, "spp": 4, "primal_spp": 4, "max_depth": 2,
+            "refinement_iterations": 0, "iterations": 70, "spp": 2, "primal_spp": 4, "max_depth": 2,
             "color_hold": 0, "even_start": False, "light_height": 16, "triptychs": 4}
 
 
@@ -149,16 +149,16 @@ class FitConfig:
     flexicubes_weights: bool = False
     """Also optimise the 21 weights per cube of FlexiCubes, which makes a step slower by a tenth; the hat is
     none the better for it."""
-    iterations: int = 260
-    """Steps of the joint stage."""
+    iterations: int = 450
+    """Steps of the joint stage; more and noisier ones come closer than fewer with more samples."""
     warmup: float = 0.15
     """Fraction of these steps in which only material and light move."""
     detail_iterations: int = 120
     """Steps of the detail stage, which continues the joint stage on a lattice finer than --start-resolution;
     0 runs the joint stage itself on that lattice."""
-    spp: int = 8
+    spp: int = 4
     """Samples per pixel of the gradient render."""
-    primal_spp: int = 16
+    primal_spp: int = 8
     """Samples per pixel of the image that the loss compares; independent of the gradient's samples."""
     max_depth: int = 3
     """Longest path: 2 is direct light, 3 adds one interreflection."""

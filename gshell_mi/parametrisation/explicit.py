@@ -51,10 +51,9 @@ class ExplicitGrid(Parametrisation):
         diffuse = diffuse or LatticeDiffusion(self.lattice)
         far, local = decay * rules.rate * self.lattice.spacing, decay * rules.deform_rate
         rates = {"sdf": far, "msdf": far, "deform": local, "weights": local}
-        for name, gradient in gradients.items():
-            gradient = trusted(gradient)
-            if name in CHANNELS:
-                gradient = diffuse(gradient, smoothing)
+        steps = {name: trusted(gradient) for name, gradient in gradients.items()}
+        steps |= diffuse.together({name: steps[name] for name in steps if name in CHANNELS}, smoothing)
+        for name, gradient in steps.items():
             dr.set_grad(optimizer[name], gradient)
         optimizer.set_learning_rate({name: rates[name] for name in gradients})
         optimizer.step()

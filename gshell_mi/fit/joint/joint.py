@@ -188,9 +188,9 @@ class JointStage:
         config, optimizer = self.config, self.material_optimizer
         if not optimizer.state:
             return
-        for name in self.material.on_lattice:
-            gradient = dr.grad(optimizer[name])
-            dr.set_grad(optimizer[name], diffuse(gradient, config.material_gradient_smoothing))
+        gradients = {name: dr.grad(optimizer[name]) for name in self.material.on_lattice}
+        for name, gradient in diffuse.together(gradients, config.material_gradient_smoothing).items():
+            dr.set_grad(optimizer[name], gradient)
         rates = dict.fromkeys(optimizer.keys(), decay_at(progress) * config.material_lr)
         if self.light and progress < config.color_hold:
             rates["vertex_color"] *= (progress / config.color_hold) ** 2
