@@ -35,7 +35,7 @@ class ReportConfig:
     """Pictures of the turntable."""
     turntable_size: int = 320
     """Its width and height in pixels; even."""
-    turntable_spp: int = 8
+    turntable_spp: int = 16
     """Its samples per pixel."""
     views: int = 8
     """Views that are shown, spread evenly over the training views."""
