@@ -68,9 +68,9 @@ def step(mover, integrator, seed, weights):
 
 
 def run(faces, resolution, depth, repeats):
-    def build(resolution):
+    def build(pixels):
         v, f = shirt(faces)
-        return (gradient_scenes.load(gradient_scenes.camera(resolution, (1.5, 1.5, 4)), gradient_scenes.sky(),
+        return (gradient_scenes.load(gradient_scenes.camera(pixels, (1.5, 1.5, 4)), gradient_scenes.sky(),
                                      gradient_scenes.make_mesh("subject", v, f)),
                 gradient_scenes.translation(v, (1, 0, 0)))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
+from itertools import islice
 
 import drjit as dr
 import mitsuba as mi
@@ -81,18 +82,19 @@ class LatticeDiffusion:
         """The same of several fields at once, which is faster than one after the other."""
         if smoothing == 0 or (self._vertices is not None and dr.width(self._vertices) == 0):
             return dict(fields)
+        # What is still to be added to them, as to gradients, cannot wait for the kernel that packs them.
+        dr.eval(list(fields.values()))
         columns = [column for field in fields.values() for column in self._columns(field)]
         diffused = []
         # Four values that lie side by side are gathered in twice the time of one, three in five times.
-        while columns:
-            group, columns = columns[:4], columns[4:]
-            kind = {1: mi.Float, 2: mi.Vector2f}.get(len(group), mi.Vector4f)
-            padded = group + [mi.Float(0)] * (kind is mi.Vector4f and 4 - len(group))
-            solution = self._diffused(kind, dr.ravel(kind(*padded)), smoothing)
+        for first in range(0, len(columns), 4):
+            group = columns[first:first + 4]
+            kind = (mi.Float, mi.Vector2f, mi.Vector4f, mi.Vector4f)[len(group) - 1]
+            padding = [mi.Float(0)] if len(group) == 3 else []
+            solution = self._diffused(kind, dr.ravel(kind(*group, *padding)), smoothing)
             diffused += [solution] if kind is mi.Float else list(dr.unravel(kind, solution))[:len(group)]
         found = iter(diffused)
-        return {name: self._with_columns(field, [next(found) for _ in self._columns(field)])
-                for name, field in fields.items()}
+        return {name: self._with_columns(field, found) for name, field in fields.items()}
 
     def _columns(self, field: mi.Float) -> list[mi.Float]:
         """The channels of a field at the vertices that are diffused."""
@@ -100,9 +102,10 @@ class LatticeDiffusion:
         values = dr.unravel(kind, field) if self._vertices is None else dr.gather(kind, field, self._vertices)
         return [values] if kind is mi.Float else list(values)
 
-    def _with_columns(self, field: mi.Float, columns: list[mi.Float]) -> mi.Float:
-        """A field whose channels are ``columns`` at the vertices that are diffused."""
-        values = self._kind(field)(*columns)
+    def _with_columns(self, field: mi.Float, columns: Iterator[mi.Float]) -> mi.Float:
+        """A field whose channels are the next of ``columns`` at the vertices that are diffused."""
+        kind = self._kind(field)
+        values = next(columns) if kind is mi.Float else kind(*islice(columns, 3))
         if self._vertices is None:
             return dr.ravel(values)
         whole = mi.Float(field)
@@ -135,13 +138,14 @@ class LatticeDiffusion:
             that were known before keep their value.
         """
         channels = dr.width(values) // self._count
-        norm = self(weights, smoothing)
+        spread = self.together({"values": values, "weights": weights}, smoothing)
+        norm = spread["weights"]
         # Known vertices keep what they know, the others take the mean of what reaches them.
         original, reached = weights > 0, norm > 1e-12
         vertex = dr.arange(mi.UInt32, channels * self._count) // channels
         original_here, reached_here = (dr.gather(mi.Bool, mask, vertex) for mask in (original, reached))
         divisor = dr.gather(mi.Float, dr.select(original, weights, norm), vertex)
-        total = dr.select(original_here, values, self(values, smoothing))
+        total = dr.select(original_here, values, spread["values"])
         known = original | reached
         return dr.select(original_here | reached_here, total / divisor, 0), known
 

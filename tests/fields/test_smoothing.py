@@ -79,6 +79,23 @@ def test_channels_do_not_mix(field):
         np.testing.assert_allclose(result[:, channel], single, atol=1e-6)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_fields_that_are_added_to_just_before(count):
+    """As gradients are; any number of them together is what each is alone."""
+    def spike(at):
+        field = dr.zeros(mi.Float, N**3)
+        dr.scatter_reduce(dr.ReduceOp.Add, field, mi.Float(1), mi.UInt32(at))
+        return field
+
+    diffuse = LatticeDiffusion(LATTICE)
+    together = diffuse.together({str(i): spike(40 * i) for i in range(count)}, 2.0)
+    assert list(together) == [str(i) for i in range(count)]
+    for i in range(count):
+        alone = diffuse(spike(40 * i), 2.0)
+        assert dr.any(alone != 0)
+        np.testing.assert_allclose(together[str(i)].numpy(), alone.numpy(), atol=1e-6)
+
+
 @pytest.mark.parametrize("channels", [1, 3])
 def test_extend(channels):
     """A value known on one slab, weighted, spreads: the known keep theirs, the far away stay unknown."""
