@@ -11,6 +11,11 @@ from .silhouette_edges import project_to_film
 #: Share of the points that are tried as the place where a mesh turns away from the light
 _TURNING = 0.2
 
+#: How far beside edges light passes, and how deep in their wedges it is stopped, in units of rounding errors'
+#: scale. Many edges of a fine mesh that light grazes lie within 1e-4 of one line, and only the outermost
+#: counts; but what misses the wedge by rounding, seen from a distant shadow, must not count as light.
+_BESIDE, _INSIDE = 2e-6, 4e-5
+
 #: Sine of half the angle of a wedge; in sharper ones, points are nearer to the sides.
 _SHARPEST = 1e-2
 
@@ -64,8 +69,7 @@ class ShadowCurves:
         share = dr.select(can_turn, dr.select(cast, 1 - _TURNING, _TURNING), mi.Float(1))
         drawn.weight = drawn.weight / share
         valid = dr.isfinite(dr.squared_norm(outward)) & (drawn.weight > 0)
-        lift = 4e-5 * (1 + dr.max(dr.abs(y)))
-        return cast, mi.Vector3f(outward * lift), valid
+        return cast, mi.Vector3f(outward * (_BESIDE * _scale(y))), valid
 
     def follow(self, positions, drawn, cast, outward, bounce):
         """From points on edges to what a camera may see of their shadow."""
@@ -141,12 +145,18 @@ class ShadowCurves:
         """Rays towards the light that pass by the edge, and that its wedge stops."""
         lit = mi.Ray3f(followed.y, drawn.towards(followed.y))
         # Straight in from a sharp edge would be out again on the other side.
-        depth = dr.select(cast, -outward, dr.norm(outward) * self._into(drawn.edge))
-        inside = followed.y - outward + depth
+        into = dr.select(cast, -dr.normalize(outward) * dr.maximum(_scale(followed.lit), _scale(followed.y)),
+                         self._into(drawn.edge) * _scale(followed.y))
+        inside = followed.y - outward + _INSIDE * into
         origin = dr.select(cast, followed.lit, inside)
         direction = dr.select(cast, dr.normalize(inside - followed.lit), drawn.towards(inside))
-        origin += direction * dr.select(cast, 1e-4 * (1 + dr.max(dr.abs(origin))), 0)
+        origin += direction * dr.select(cast, 1e-4 * _scale(origin), 0)
         return lit, mi.Ray3f(mi.Point3f(origin), direction)
+
+
+def _scale(p):
+    """What rounding errors of points are in proportion to."""
+    return 1 + dr.max(dr.abs(p))
 
 
 def _slide(vector, normal, along):

@@ -96,6 +96,34 @@ def test_few_samples_are_unbiased():
     assert abs(few - many) <= 3.5 * np.hypot(few_error, error)
 
 
+def shadow_of_a_curtain(profile):
+    """Derivative of a floor's image as a curtain of the profile, (x, z) from top to bottom, moves along x."""
+    x, z = np.array(profile, float).T
+    count = len(profile)
+    v = np.stack([np.repeat(x, 2), np.tile([-2.0, 2.0], count), np.repeat(z, 2)], -1)
+    i = 2 * np.arange(count - 1)
+    f = np.concatenate([np.stack([i, i + 1, i + 2], -1), np.stack([i + 1, i + 3, i + 2], -1)])
+    light = {"type": "directional", "direction": [0, 0, -1],
+             "irradiance": {"type": "rgb", "value": [1.0] * 3}}
+    floor = scenes.plane(size=8)
+    case = scenes.GradientScene("curtain", "", lambda _: (
+        scenes.load(scenes.camera(RESOLUTION, (0.4, 0, 0.4), (0.02, 0, 0)), light,
+                    scenes.make_mesh("subject", v, f),
+                    floor=scenes.make_mesh("floor", floor[0][:, [0, 2, 1]], floor[1], smooth=False)),
+        scenes.translation(v, (1, 0, 0))))
+    mover = scenes.Mover(case, RESOLUTION)
+    images = [scenes.forward_image(mover, path(case, light_edge_samples=16), 16, seed) for seed in range(8)]
+    return np.mean([image[..., :3].sum() for image in images])
+
+
+def test_edges_in_line_with_the_light_cast_one_shadow():
+    """Where light grazes a fine mesh, several of its edges are silhouettes; one is outermost."""
+    one = shadow_of_a_curtain([(-0.05, 1.5), (0, 1), (-1, 0.6)])
+    two = shadow_of_a_curtain([(-0.05, 1.5), (0, 1), (-1.2e-4, 0.97), (-3e-5, 0.94), (-1, 0.6)])
+    assert one != 0
+    assert two == pytest.approx(one, rel=0.02)
+
+
 def test_alpha_of_a_scaled_sphere():
     """The coverage of a sphere is the area of its projection: a closed form."""
     case = CASES["sphere_scaling"]
