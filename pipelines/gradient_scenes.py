@@ -169,13 +169,18 @@ def _sheet(motion):
     return build
 
 
-def _shirt(motion):
+def _shirt(motion, light=sky):
     def build(resolution):
         v, f = shirt()
         normals = np.array(trimesh.Trimesh(v, f, process=False).vertex_normals)
-        return (load(camera(resolution, (1.5, 1.5, 4)), sky(), make_mesh("subject", v, f)),
+        return (load(camera(resolution, (1.5, 1.5, 4)), light(), make_mesh("subject", v, f)),
                 translation(v) if motion == "translate" else 0.5 * normals)
     return build
+
+
+def _from_above():
+    return {"type": "directional", "direction": [-0.1, -1, -0.1],
+            "irradiance": {"type": "rgb", "value": [2.0] * 3}}
 
 
 def _pleats(resolution):
@@ -294,6 +299,8 @@ SCENES = (
     GradientScene("sheet_scaling", "open boundary", _sheet("scale")),
     GradientScene("shirt_translating", "open garment, self-shadowed", _shirt("translate")),
     GradientScene("shirt_inflating", "open garment, deforming", _shirt("inflate")),
+    GradientScene("shirt_grazed", "fine mesh along which light passes",
+                  _shirt("translate", _from_above)),
     GradientScene("sharp_pleats", "smooth-shaded sharp folds, some faces almost edge-on", _pleats),
     GradientScene("cube_constant", "cube under a constant environment (Mitsuba #1895)", _cube),
     GradientScene("cube_flat_shaded", "creases between flat faces", _flat_cube_sky),
