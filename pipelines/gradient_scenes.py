@@ -178,11 +178,6 @@ def _shirt(motion, light=sky):
     return build
 
 
-def _from_above():
-    return {"type": "directional", "direction": [-0.1, -1, -0.1],
-            "irradiance": {"type": "rgb", "value": [2.0] * 3}}
-
-
 def _pleats(resolution):
     v, f = pleats()
     return load(camera(resolution, (1.5, 1.5, 4)), sky(), make_mesh("subject", v, f)), translation(v)
@@ -282,9 +277,9 @@ def _point_light(position=(2, 4, 1)):
     return {"type": "point", "position": list(position), "intensity": {"type": "rgb", "value": [16.0] * 3}}
 
 
-def _directional_light():
-    return {"type": "directional", "direction": [-0.4, -1, -0.2],
-            "irradiance": {"type": "rgb", "value": [1.0] * 3}}
+def directional_light(direction=(-0.4, -1, -0.2), irradiance=1.0):
+    return {"type": "directional", "direction": list(direction),
+            "irradiance": {"type": "rgb", "value": [irradiance] * 3}}
 
 
 def _area_light():
@@ -300,7 +295,7 @@ SCENES = (
     GradientScene("shirt_translating", "open garment, self-shadowed", _shirt("translate")),
     GradientScene("shirt_inflating", "open garment, deforming", _shirt("inflate")),
     GradientScene("shirt_grazed", "fine mesh along which light passes",
-                  _shirt("translate", _from_above)),
+                  _shirt("translate", lambda: directional_light((-0.1, -1, -0.1), 2.0))),
     GradientScene("sharp_pleats", "smooth-shaded sharp folds, some faces almost edge-on", _pleats),
     GradientScene("cube_constant", "cube under a constant environment (Mitsuba #1895)", _cube),
     GradientScene("cube_flat_shaded", "creases between flat faces", _flat_cube_sky),
@@ -323,7 +318,7 @@ SCENES = (
     GradientScene("shadow_point_light", "hard shadow, point light",
                   _shadow_on_plane(_point_light), step=0.08),
     GradientScene("shadow_directional", "hard shadow, directional light",
-                  _shadow_on_plane(_directional_light), step=0.08),
+                  _shadow_on_plane(directional_light), step=0.08),
 )
 
 

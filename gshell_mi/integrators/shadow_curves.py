@@ -11,9 +11,9 @@ from .silhouette_edges import project_to_film
 #: Share of the points that are tried as the place where a mesh turns away from the light
 _TURNING = 0.2
 
-#: How far beside edges light passes, and how deep in their wedges it is stopped, in units of rounding errors'
-#: scale. Many edges of a fine mesh that light grazes lie within 1e-4 of one line, and only the outermost
-#: counts; but what misses the wedge by rounding, seen from a distant shadow, must not count as light.
+#: How far beside edges light passes, and how deep in their wedges it is stopped, in units of ``_scale``. Many
+#: edges of a fine mesh that light grazes lie within 1e-4 of one line, and only the outermost counts; but what
+#: misses the wedge by rounding, seen from a distant shadow, must not count as light.
 _BESIDE, _INSIDE = 2e-6, 4e-5
 
 #: Sine of half the angle of a wedge; in sharper ones, points are nearer to the sides.
@@ -93,7 +93,7 @@ class ShadowCurves:
         via = None
         if bounce:
             via = mi.warp.square_to_uniform_sphere(drawn.via)
-            p, normal, hit = self._next_surface(p, -via, 1e-4 * (1 + dr.max(dr.abs(lit))), valid)
+            p, normal, hit = self._next_surface(p, -via, 1e-4 * _scale(lit), valid)
             along, across = (_slide(x, normal, via) for x in (along, across))
             valid &= hit
         return ShadowPoints(mi.Point3f(p), mi.Point3f(lit), y_now, along, across, valid, via)

@@ -103,11 +103,10 @@ def shadow_of_a_curtain(profile):
     v = np.stack([np.repeat(x, 2), np.tile([-2.0, 2.0], count), np.repeat(z, 2)], -1)
     i = 2 * np.arange(count - 1)
     f = np.concatenate([np.stack([i, i + 1, i + 2], -1), np.stack([i + 1, i + 3, i + 2], -1)])
-    light = {"type": "directional", "direction": [0, 0, -1],
-             "irradiance": {"type": "rgb", "value": [1.0] * 3}}
     floor = scenes.plane(size=8)
     case = scenes.GradientScene("curtain", "", lambda _: (
-        scenes.load(scenes.camera(RESOLUTION, (0.4, 0, 0.4), (0.02, 0, 0)), light,
+        scenes.load(scenes.camera(RESOLUTION, (0.4, 0, 0.4), (0.02, 0, 0)),
+                    scenes.directional_light((0, 0, -1)),
                     scenes.make_mesh("subject", v, f),
                     floor=scenes.make_mesh("floor", floor[0][:, [0, 2, 1]], floor[1], smooth=False)),
         scenes.translation(v, (1, 0, 0))))
