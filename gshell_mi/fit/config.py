@@ -156,9 +156,9 @@ class FitConfig:
     detail_iterations: int = 120
     """Steps of the detail stage, which continues the joint stage on a lattice finer than --start-resolution;
     0 runs the joint stage itself on that lattice."""
-    spp: int = 4
+    spp: int = 2
     """Samples per pixel of the gradient render."""
-    primal_spp: int = 8
+    primal_spp: int = 6
     """Samples per pixel of the image that the loss compares; independent of the gradient's samples."""
     max_depth: int = 3
     """Longest path: 2 is direct light, 3 adds one interreflection."""

@@ -22,7 +22,7 @@ def test_targets_grow_with_pixels_and_the_lattice_with_cells():
     assert 4 < fine.lattice / one.lattice < 8, "between the surface and the volume"
     fine, finest = (MemoryEstimate.of(FitConfig(), resolution, SIZES).lattice for resolution in (256, 512))
     assert finest < 4 * fine, "in blocks it follows the surface"
-    assert MemoryEstimate.of(FitConfig(primal_spp=16), 64, SIZES).samples == 2 * one.samples
+    assert MemoryEstimate.of(FitConfig(primal_spp=12), 64, SIZES).samples == 2 * one.samples
     mixed = np.array([[100, 200], [400, 300]])
     assert MemoryEstimate.of(FitConfig(), 64, mixed).samples == one.samples * 120000 // 256**2
 
