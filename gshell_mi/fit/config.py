@@ -23,7 +23,7 @@ _CALMER = 0.3
 
 #: What ``--preview`` has instead: less of everything, but for the steps that openings need.
 _PREVIEW = {"resolution": 48, "ghost_iterations": 600, "ghost_batch": 16384, "carving_iterations": 0,
-            "refinement_iterations": 0, "iterations": 70, "spp": 2, "primal_spp": 4, "max_depth": 2,
+            "refinement_iterations": 0, "iterations": 70, "primal_spp": 4, "max_depth": 2,
             "color_hold": 0, "even_start": False, "light_height": 16, "triptychs": 4}
 
 

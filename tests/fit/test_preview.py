@@ -35,8 +35,8 @@ def test_preview_is_less_work_in_every_respect(given):
     assert usual.config == FitConfig() and usual.report
     assert rough.config == FitConfig.preview() and not rough.report
     assert rough.config.resolution < 64
-    for name in ("ghost_batch", "carving_iterations", "refinement_iterations", "iterations", "spp",
-                 "primal_spp", "max_depth", "light_height", "triptychs"):
+    for name in ("ghost_batch", "carving_iterations", "refinement_iterations", "iterations", "primal_spp",
+                 "max_depth", "light_height", "triptychs"):
         assert getattr(rough.config, name) < getattr(usual.config, name), name
     pixels = [config.ghost_iterations * config.ghost_batch for config in (rough.config, usual.config)]
     assert pixels[0] < pixels[1] / 2
@@ -52,7 +52,9 @@ def test_other_options_override_those_of_the_preview(given, order):
 
 
 def test_a_value_equal_to_the_usual_default_counts_too(given):
-    assert given("--preview", "--spp", str(FitConfig().spp)).config.spp == FitConfig().spp
+    usual = FitConfig().primal_spp
+    assert FitConfig.preview().primal_spp != usual
+    assert given("--preview", "--primal-spp", str(usual)).config.primal_spp == usual
 
 
 def test_without_refinement_there_is_no_ghost_for_it(bowl_scene, tmp_path, monkeypatch):
