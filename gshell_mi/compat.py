@@ -82,8 +82,21 @@ def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> mi.Mesh
 
 
 def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> mi.Scene:
-    """A scene of just that mesh, named ``mesh``, for its rays."""
-    return mi.load_dict({"type": "scene", "mesh": triangle_mesh("mesh", vertices, faces)})
+    """A scene of just that mesh for its rays, to be moved by ``move_mesh``.
+
+    The mesh is an instance: on the CPU, Mitsuba splits triangles for the BVH of a scene, but not for that
+    of a group, which is built three times as fast; rays are as fast in either.
+    """
+    return mi.load_dict({"type": "scene",
+                         "group": {"type": "shapegroup", "mesh": triangle_mesh("mesh", vertices, faces)},
+                         "instance": {"type": "instance", "shapegroup": {"type": "ref", "id": "group"}}})
+
+
+def move_mesh(scene: mi.Scene, positions: mi.Float) -> None:
+    """Puts the vertices of a ``mesh_scene`` elsewhere: (3 V,) positions, x0, y0, z0, x1, ..."""
+    params = mi.traverse(scene)
+    params["group.mesh.vertex_positions"] = positions
+    params.update()
 
 
 def write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ... import losses
 from ...activations import inverse_softplus, sigmoid, softplus
-from ...compat import mesh_scene
+from ...compat import mesh_scene, move_mesh
 from ...fields.smoothing import MeshDiffusion
 from ...images import decibels
 from ...means import mean
@@ -174,9 +174,7 @@ class RadianceGhost:
         self._positions = positions
         if self.glossy:
             self._normals = self._smooth_normals()
-        parameters = mi.traverse(self.scene)
-        parameters["mesh.vertex_positions"] = positions
-        parameters.update()
+        move_mesh(self.scene, positions)
 
     def _set_opacity(self, logits: np.ndarray) -> None:
         """New logits, and an optimiser without memory of what led to the old ones."""
