@@ -6,7 +6,7 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from ..errors import UserError
 from ..timing import phase
-from . import reparameterised_film, shadow_boundary
+from . import primal_film, reparameterised_film, shadow_boundary
 from .path_replay import replay
 from .path_sample import PathSample
 from .path_vertex import delta_lobe, material_point, mis_weight, sample_direct, scattering, segment
@@ -63,6 +63,11 @@ class GShellPathIntegrator(ADIntegrator):
         check_meshes(scene)
         result = self.primal(scene, sampler, mi.Ray3f(ray), active)
         return result.value, result.alpha > 0.5, result.aovs, None
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        if not develop:
+            return super().render(scene, sensor, seed, spp, develop, evaluate)
+        return primal_film.render(self, scene, sensor, seed, spp)
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         return reparameterised_film.render_forward(self, scene, sensor, seed, spp)
