@@ -12,7 +12,7 @@ from ..errors import UserError
 #: Least sensible value of a number, where that is not 0.
 _LEAST = {"resolution": 4, "start_resolution": 4, "band_resolution": 4, "triptychs": 1, "ghost_iterations": 1,
           "ghost_batch": 1, "ghost_sheets": 1, "carving_batch": 1, "spp": 1, "primal_spp": 1,
-          "max_depth": 2, "reparam_depth": 1, "light_height": 3}
+          "max_depth": 2, "gradient_depth": 2, "reparam_depth": 1, "light_height": 3}
 
 #: Greatest sensible value, where there is one.
 _MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "unseen_area": 1, "warmup": 1,
@@ -160,13 +160,18 @@ class FitConfig:
     """Samples per pixel of the gradient render."""
     primal_spp: int = 6
     """Samples per pixel of the image that the loss compares; independent of the gradient's samples."""
-    max_depth: int = 3
-    """Longest path: 2 is direct light, 3 adds one interreflection."""
+    max_depth: int = 5
+    """Longest path: 2 is direct light, 3 adds one interreflection. That of the exported scene is 5."""
+    gradient_depth: int = 3
+    """Longest path that is differentiated; what longer ones add to an image counts as constant."""
     reparam_depth: int = 1
     """Path segments whose visibility is differentiated: 1 is what the camera sees, 2 adds shadows. Shapes
     come out the same with either, a dress with deep folds 0.2 dB better with 2, and 1 is faster."""
     geometry_lr: float = 0.08
-    """Largest change of sdf and mSDF per step, in cells."""
+    """Largest change of sdf per step, in cells; with networks, of the mSDF too."""
+    msdf_lr: float = 0.24
+    """Largest change of the mSDF per step, in cells. Its steps are halfway between one size per vertex and
+    one for all, so that a rim moves where it hardly shows, too."""
     deform_lr: float = 0.02
     """Largest change of the vertex offsets per step; 1 is the greatest offset allowed."""
     geometry_smoothing: float = 8.0

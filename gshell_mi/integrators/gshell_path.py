@@ -27,6 +27,8 @@ class GShellPathIntegrator(ADIntegrator):
 
     * ``max_depth`` (int, default 6), ``rr_depth`` (int, default 5), ``hide_emitters`` (bool, default
       false): as for ``prb``.
+    * ``gradient_depth`` (int, default ``max_depth``): longest path that is differentiated. What longer ones
+      add to the image counts as constant, which spares the time of their derivatives.
     * ``reparam_depth`` (int, default 1): how many segments of a path may lose sight of what they see:
       1 the camera's, 2 also what the first surface receives, 3 also what the second one does. Shadows
       need 2; fits of whole objects do as well without, in less time (``docs/gradients.md``).
@@ -50,6 +52,10 @@ class GShellPathIntegrator(ADIntegrator):
         self.hide_emitters = props.get("hide_emitters", False)
         self.warp_radius = props.get("warp_radius", 2.0)
         self.cull_hidden = props.get("cull_hidden", True)
+        gradient_depth = props.get("gradient_depth", max(self.max_depth, 1))
+        if gradient_depth < 1:
+            raise UserError(f"gshell_path: gradient_depth is {gradient_depth}, but has to be at least 1.")
+        self.gradient_depth = min(gradient_depth, self.max_depth)
         self.reparam_depth = props.get("reparam_depth", 1)
         if self.reparam_depth not in (1, 2, 3):
             raise UserError(f"gshell_path: reparam_depth is {self.reparam_depth}, but has to be 1, 2 or 3.")
@@ -157,7 +163,7 @@ class GShellPathIntegrator(ADIntegrator):
 
     def replays(self, scene):
         """Whether ``attached`` needs to know the radiance and coverage of its samples beforehand."""
-        return self.max_depth > 3 or has_bsdf_flag(scene, mi.BSDFFlags.Delta)
+        return self.gradient_depth > 3 or has_bsdf_flag(scene, mi.BSDFFlags.Delta)
 
     def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
         """Derivatives of camera paths.
@@ -196,7 +202,7 @@ class GShellPathIntegrator(ADIntegrator):
         surface_emitters = has_surface_emitters(scene)
         special = has_bsdf_flag(scene, mi.BSDFFlags.Delta)
         context = mi.BSDFContext()
-        deeper = self.max_depth > 3
+        deeper = self.gradient_depth > 3
         depth = mi.UInt32(0)
         with dr.suspend_grad():
             pi = self.first_hit(scene, dr.detach(ray))
@@ -214,8 +220,8 @@ class GShellPathIntegrator(ADIntegrator):
         else:
             alpha = state.alpha
 
-        for vertex in range(min(self.max_depth - 1, 2)):
-            active &= (depth + 1 < self.max_depth) & si.is_valid()
+        for vertex in range(min(self.gradient_depth - 1, 2)):
+            active &= (depth + 1 < self.gradient_depth) & si.is_valid()
             si_now = dr.detach(si)
             radiance += throughput * beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active, True,
                                                           surface_emitters)
@@ -270,7 +276,7 @@ class GShellPathIntegrator(ADIntegrator):
 
     def to_string(self):
         return (f"GShellPathIntegrator[max_depth={self.max_depth}, rr_depth={self.rr_depth}, "
-                f"hide_emitters={self.hide_emitters}, "
+                f"gradient_depth={self.gradient_depth}, hide_emitters={self.hide_emitters}, "
                 f"reparam_depth={self.reparam_depth}, warp_radius={self.warp_radius}]")
 
 

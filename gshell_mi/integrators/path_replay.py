@@ -25,7 +25,7 @@ def replay(integrator, mode, scene, sampler, ray, pi, si_prev, L, beta, eta, pdf
     pi_prev, ray_prev = dr.zeros(mi.PreliminaryIntersection3f, dr.width(pi)), mi.Ray3f(ray)
     active, scattered = mi.Bool(active), mi.Bool(scattered)
 
-    while dr.hint(active, max_iterations=integrator.max_depth - 2, label="gshell_path (replay)"):
+    while dr.hint(active, max_iterations=integrator.gradient_depth - 2, label="gshell_path (replay)"):
         second = depth == start
         with dr.resume_grad():
             p_first = mi.Point3f(first_p)
@@ -41,7 +41,7 @@ def replay(integrator, mode, scene, sampler, ray, pi, si_prev, L, beta, eta, pdf
             emitted = beta * integrator.emission(scene, si, si_prev, pdf_prev, delta_prev, scattered, active)
         si_now = dr.detach(si)
         bsdf = si_now.bsdf(mi.RayDifferential3f(ray))
-        active_next = active & (depth + 1 < integrator.max_depth) & si_now.is_valid()
+        active_next = active & (depth + 1 < integrator.gradient_depth) & si_now.is_valid()
         with dr.resume_grad():
             direct = beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, True,
                                           surface_emitters)

@@ -50,4 +50,5 @@ class _PaddedBlock:
         self._block.put(position, [*values, *([mi.Float(0)] * padding)])
 
     def as_film_has_it(self):
-        return mi.ImageBlock(self._block.tensor()[..., :self._count], self._offset, self._filter, self._border)
+        channels = self._block.tensor()[..., :self._count]
+        return mi.ImageBlock(channels, self._offset, self._filter, self._border)

@@ -22,7 +22,9 @@ class StepRules:
     """How far and how smoothly the fields move; the units do not depend on the lattice."""
 
     rate: float = 0.08
-    """Largest change of ``sdf`` and ``msdf`` per step at the start, in cells; falls tenfold."""
+    """Largest change of ``sdf`` per step at the start, in cells; falls tenfold."""
+    msdf_rate: float = 0.24
+    """The same of ``msdf``, where its lattice values are optimised; networks move it as ``sdf``."""
     deform_rate: float = 0.02
     """The same of ``deform`` and ``weights``."""
     smoothing: float = 8.0

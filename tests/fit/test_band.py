@@ -75,8 +75,9 @@ def test_blocks_follow_the_surface_with_all_that_is_stored_in_them(fit):
         joint.step(iteration)
         lattice = joint.subject.lattice
         assert lattice.covers(joint.subject.surface.cells)
-        for optimizer, names in ((joint.geometry.optimizer, ("sdf", "msdf", "deform")),
-                                 (joint.material_optimizer, joint.material.on_lattice)):
+        geometry = [(optimizer, tuple(optimizer.keys())) for optimizer in joint.geometry.optimizers.values()]
+        assert sorted(name for _, names in geometry for name in names) == ["deform", "msdf", "sdf"]
+        for optimizer, names in (*geometry, (joint.material_optimizer, joint.material.on_lattice)):
             for name in names:
                 value, _, _, (step, moment, _, _) = optimizer.state[name]
                 assert dr.width(value) == dr.width(moment) and dr.width(value) % lattice.vertex_count == 0

@@ -180,3 +180,15 @@ def test_one_vertex_does_not_hold_up_the_others():
     assert moved[1.0] > 0
     assert moved[dr.inf] > 0.99 * moved[1.0]
     assert moved[1e4] > 0.95 * moved[30.0] > 0.05 * moved[1.0]
+
+
+def test_a_rim_moves_where_it_hardly_shows_and_a_surface_goes_by_what_shows_most():
+    lattice, names = TetLattice(8), ("sdf", "msdf")
+    made = make_parametrisation("explicit", bowl(lattice), lattice, StepRules(smoothing=0.0))
+    before = {name: field.numpy() for name, field in made.fields().items()}
+    gradient = np.zeros(lattice.vertex_count, np.float32)
+    gradient[100:200], gradient[300] = 1.0, 0.01
+    made.step({name: mi.Float(gradient) for name in names}, progress=0.0)
+    moved = {name: np.abs(made.fields()[name].numpy() - before[name]) / lattice.spacing for name in names}
+    np.testing.assert_allclose(moved["sdf"][[100, 300, 400]], [0.08, 0.0008, 0], rtol=0.01, atol=1e-6)
+    np.testing.assert_allclose(moved["msdf"][[100, 300, 400]], [0.24, 0.024, 0], rtol=0.01, atol=1e-6)

@@ -16,12 +16,12 @@ from ...means import mean
 from ...parametrisation import StepRules, make_parametrisation
 from ...scene import FitScene
 from ...schedules import decay_at
+from ...tempered_adam import TemperedAdam
 from ...timing import phase
 from ..bookkeeping.observer import Preview
 from ..config import FitConfig
 from ..ghost.opening import without_specks
 from .regularisers import Regularisers
-from .tempered_adam import TemperedAdam
 
 #: Between the first sampler seeds of fits whose seeds are neighbours: no step shares its samples.
 _SEEDS_APART = 1 << 20
@@ -60,13 +60,14 @@ class JointStage:
         if config.geometry_only:
             self.subject.shade_flat()
         self._integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
+                                         "gradient_depth": config.gradient_depth,
                                          "reparam_depth": config.reparam_depth, "hide_emitters": True})
         resting = {"msdf"} if config.watertight else set()
         if not config.flexicubes_weights:
             resting.add("weights")
         moving = [name for name in self.subject.field_names if name not in resting]
         start = {name: self.parameters[f"subject.{name}"] for name in moving}
-        rules = StepRules(config.geometry_lr, config.deform_lr, config.geometry_smoothing,
+        rules = StepRules(config.geometry_lr, config.msdf_lr, config.deform_lr, config.geometry_smoothing,
                           config.geometry_detail)
         self.geometry = make_parametrisation(config.field, start, self.subject.lattice, rules,
                                              seed=config.seed)

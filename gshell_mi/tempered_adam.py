@@ -11,7 +11,8 @@ class TemperedAdam(mi.ad.Adam):
     Adam divides by and what uniform Adam does (Nicolet et al. 2021).
 
     With one step size per value, what the images tell nothing of walks at random as far as the rest moves;
-    with one for all, only the brightest texels of a light with a sun in it move.
+    with one for all, only the brightest texels of a light with a sun in it move, and of a rim only those
+    places where it shows most.
     """
 
     def _step(self, cache, value, grad, lr, extra):

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from gshell_mi.fit.joint.tempered_adam import TemperedAdam
+from gshell_mi.tempered_adam import TemperedAdam
 
 
 def stepped(optimizer, gradient) -> np.ndarray:
