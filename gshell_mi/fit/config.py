@@ -128,7 +128,7 @@ class FitConfig:
     """Largest movement of a vertex per step of the second round, in cells; falls to 0 like a cosine."""
     folds_detail: float = 11.0
     """Lambda at the end of the second round, which starts with that of the first's end."""
-    folds_descent: float = 0.99
+    folds_descent: float = 0.98
     """The second round ends after a quarter of its steps unless the image error is below this fraction of
     what it was at first: such rounds are not kept in the end."""
     folds_gain: float = 0.97

@@ -27,8 +27,8 @@ class GShellPathIntegrator(ADIntegrator):
 
     * ``max_depth`` (int, default 6), ``rr_depth`` (int, default 5), ``hide_emitters`` (bool, default
       false): as for ``prb``.
-    * ``gradient_depth`` (int, default ``max_depth``): longest path that is differentiated. What longer ones
-      add to the image counts as constant, which spares the time of their derivatives.
+    * ``gradient_depth`` (int, default ``max_depth``): derivatives are those of the image with this
+      ``max_depth``. What longer paths add to the image counts as constant, which spares time.
     * ``reparam_depth`` (int, default 1): how many segments of a path may lose sight of what they see:
       1 the camera's, 2 also what the first surface receives, 3 also what the second one does. Shadows
       need 2; fits of whole objects do as well without, in less time (``docs/gradients.md``).
@@ -67,7 +67,7 @@ class GShellPathIntegrator(ADIntegrator):
 
     def sample(self, mode, scene, sampler, ray, active=True, **kwargs):
         check_meshes(scene)
-        result = self.primal(scene, sampler, mi.Ray3f(ray), active)
+        result = self.primal(scene, sampler, mi.Ray3f(ray), active, max_depth=self.max_depth)
         return result.value, result.alpha > 0.5, result.aovs, None
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
@@ -94,12 +94,13 @@ class GShellPathIntegrator(ADIntegrator):
         return pi
 
     @dr.syntax
-    def primal(self, scene, sampler, ray, active=True, start=0):
-        """Radiance and coverage along camera rays, without derivatives.
+    def primal(self, scene, sampler, ray, active=True, start=0, max_depth=None):
+        """Radiance and coverage along camera rays, without derivatives; by default, what is differentiated.
 
         With ``start`` = 1 the rays are those of a second segment instead: the light that arrives
         along them other than from area lights.
         """
+        max_depth = self.gradient_depth if max_depth is None else max_depth
         ray = mi.Ray3f(dr.detach(ray))
         depth = mi.UInt32(start)
         L, beta, eta = mi.Spectrum(0), mi.Spectrum(1), mi.Float(1)
@@ -113,14 +114,14 @@ class GShellPathIntegrator(ADIntegrator):
         si_prev = dr.zeros(mi.SurfaceInteraction3f)
         pdf_prev, delta_prev = mi.Float(1), mi.Bool(True)
 
-        while dr.hint(active, max_iterations=self.max_depth - start, label="gshell_path (primal)"):
+        while dr.hint(active, max_iterations=max_depth - start, label="gshell_path (primal)"):
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
             bsdf = si.bsdf(ray)
             shines = active
             if dr.hint(start > 0, mode="scalar"):
                 shines = active & ~((depth == start) & si.is_valid())
             L += beta * self.emission(scene, si, si_prev, pdf_prev, delta_prev, scattered, shines)
-            active_next = active & (depth + 1 < self.max_depth) & si.is_valid()
+            active_next = active & (depth + 1 < max_depth) & si.is_valid()
             L += beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, False, False)
             # Whether the last surface of a path covers the film is sampled too.
             sampled = active & si.is_valid() if transparent else active_next

@@ -59,10 +59,10 @@ class BoundaryTerm:
 def boundary_terms(integrator, scene, tables, sensor, seed):
     """Yields the :class:`BoundaryTerm` of each kind of light, and of each depth it is seen at.
 
-    ``integrator``: a ``gshell_path``; its ``reparam_depth``, ``max_depth``, ``light_edge_samples`` and
+    ``integrator``: a ``gshell_path``; its ``reparam_depth``, ``gradient_depth``, ``light_edge_samples`` and
     ``crease_angle`` are honoured.
     """
-    depth = min(integrator.reparam_depth, integrator.max_depth)
+    depth = min(integrator.reparam_depth, integrator.gradient_depth)
     wedges = build_edge_wedges(tables, integrator.crease_angle) if depth > 1 else None
     if wedges is None:
         return
@@ -76,7 +76,7 @@ def boundary_terms(integrator, scene, tables, sensor, seed):
         return x
 
     draws = []
-    if scene.environment() is not None or integrator.max_depth > 2:
+    if scene.environment() is not None or integrator.gradient_depth > 2:
         draws += [draw_directions(scene, wedges, samples * CANDIDATES, shifts()),
                   draw_map_directions(scene, wedges, samples * CANDIDATES, shifts())]
     draws += draw_emitters(scene, wedges, samples * CANDIDATES, shifts())
@@ -101,7 +101,7 @@ class _Boundary:
 
     def term(self, drawn, bounce, samples, sampler):
         """The boundary term of drawn edge samples, or ``None`` if none of them is seen."""
-        indirect = drawn.emitter is None and not bounce and self.integrator.max_depth > 2
+        indirect = drawn.emitter is None and not bounce and self.integrator.gradient_depth > 2
         cast, outward, importance = self._importance(drawn, bounce, indirect)
         offset = sampler.next_1d()
         chosen = systematic_counts(importance, samples, dr.gather(mi.Float, offset, mi.UInt32(0)))

@@ -67,6 +67,7 @@ ROWS = [
             ("no-offsets", "no vertex offsets", {"deform_lr": 0.0}),
             ("no-warmup", "no warm-up", {"warmup": 0.0}),
             ("shadow-derivatives", "visibility of shadows differentiated", {"reparam_depth": 2}),
+            ("short-paths", "images lack what is not differentiated", {"max_depth": 3}),
             ("direct-light", "direct light only", {"max_depth": 2})),
     *_group("Material and light in the joint stage",
             ("painted-start", "colours start as the images show them", {"even_start": False}),

@@ -85,6 +85,22 @@ def test_replayed_vertices_reverse_equals_forward():
     assert reverse == pytest.approx(forward, rel=1e-3)
 
 
+def test_paths_that_are_not_differentiated_are_in_the_image_alone():
+    case = CASES["open_box"]
+    mover, weights = scenes.Mover(case, RESOLUTION), scenes.image_weights(RESOLUTION)
+    short, long, both = (
+        mi.load_dict({"type": "gshell_path", "hide_emitters": True, **depths})
+        for depths in ({"max_depth": 3}, {"max_depth": 5}, {"max_depth": 5, "gradient_depth": 3}))
+    of_short, of_long, of_both = (np.array(mi.render(mover.scene, integrator=integrator, spp=8, seed=3))
+                                  for integrator in (short, long, both))
+    np.testing.assert_array_equal(of_both, of_long)
+    assert of_long[..., :3].sum() > 1.02 * of_short[..., :3].sum()
+    assert (weighted([scenes.forward_image(mover, both, 8, 3)])[0]
+            == pytest.approx(weighted([scenes.forward_image(mover, short, 8, 3)])[0], rel=1e-4))
+    assert (scenes.reverse_derivative(mover, both, 8, 3, weights)
+            == pytest.approx(scenes.reverse_derivative(mover, short, 8, 3, weights), rel=1e-4))
+
+
 def test_few_samples_are_unbiased():
     case = CASES["sphere_scaling"]
     mover = scenes.Mover(case, RESOLUTION)
@@ -290,6 +306,11 @@ def test_other_sensors_are_refused():
 def test_reparam_depth_is_checked():
     with pytest.raises(Exception, match="reparam_depth is 7"):
         mi.load_dict({"type": "gshell_path", "reparam_depth": 7})
+
+
+def test_gradient_depth_is_checked():
+    with pytest.raises(Exception, match="gradient_depth is 0"):
+        mi.load_dict({"type": "gshell_path", "gradient_depth": 0})
 
 
 def odd_shapes(folder):
