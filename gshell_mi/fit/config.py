@@ -170,8 +170,8 @@ class FitConfig:
     geometry_lr: float = 0.08
     """Largest change of sdf per step, in cells; with networks, of the mSDF too."""
     msdf_lr: float = 0.24
-    """Largest change of the mSDF per step, in cells. Its steps are halfway between one size per vertex and
-    one for all, so that a rim moves where it hardly shows, too."""
+    """Largest change of the mSDF per step, in cells; falls a hundredfold. Its steps are halfway between one
+    size per vertex and one for all, so that a rim moves where it hardly shows, too."""
     deform_lr: float = 0.02
     """Largest change of the vertex offsets per step; 1 is the greatest offset allowed."""
     geometry_smoothing: float = 8.0

@@ -57,7 +57,7 @@ class ExplicitGrid(Parametrisation):
         smoothing = falling(rules.smoothing, rules.detail, progress)
         diffuse = diffuse or LatticeDiffusion(self.lattice)
         spacing, local = self.lattice.spacing, rules.deform_rate
-        rates = {"sdf": rules.rate * spacing, "msdf": rules.msdf_rate * spacing, "deform": local,
+        rates = {"sdf": rules.rate * spacing, "msdf": decay * rules.msdf_rate * spacing, "deform": local,
                  "weights": local}
         steps = {name: trusted(gradient) for name, gradient in gradients.items()}
         steps |= diffuse.together({name: steps[name] for name in steps if name in CHANNELS}, smoothing)
