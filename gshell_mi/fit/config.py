@@ -168,7 +168,7 @@ class FitConfig:
     """Path segments whose visibility is differentiated: 1 is what the camera sees, 2 adds shadows. Shapes
     come out the same with either, a dress with deep folds 0.2 dB better with 2, and 1 is faster."""
     geometry_lr: float = 0.08
-    """Largest change of sdf per step, in cells; with networks, of the mSDF too."""
+    """Largest change of sdf per step, in cells; of the mSDF too if --field is not explicit."""
     msdf_lr: float = 0.24
     """Largest change of the mSDF per step, in cells; falls a hundredfold. Its steps are halfway between one
     size per vertex and one for all, so that a rim moves where it hardly shows, too."""

@@ -24,8 +24,8 @@ class StepRules:
     rate: float = 0.08
     """Largest change of ``sdf`` per step at the start, in cells; falls tenfold."""
     msdf_rate: float = 0.24
-    """The same of ``msdf``, where its lattice values are optimised; falls a hundredfold, as what noise has
-    done to a rim stays. Networks move it as ``sdf``."""
+    """The same of ``msdf`` with ``explicit``; falls a hundredfold, as what noise has done to a rim stays. The
+    other kinds move it as ``sdf``."""
     deform_rate: float = 0.02
     """The same of ``deform`` and ``weights``."""
     smoothing: float = 8.0
