@@ -173,7 +173,21 @@ class MeshDiffusion:
 
     def __call__(self, values: mi.Float) -> mi.Float:
         """Diffuses a flat field of one value, or of interleaved channels, per vertex."""
-        shape = (self._count, dr.width(values) // self._count)
-        diffused = dr.empty(mi.TensorXf, shape=shape)
-        self._solver.solve(mi.TensorXf(values, shape), diffused)
-        return mi.Float(diffused.array)
+        return self.together({"": values})[""]
+
+    def together(self, fields: Mapping[str, mi.Float]) -> dict[str, mi.Float]:
+        """The same of several fields at once: four columns are solved for in the time of one."""
+        channels = {name: dr.width(field) // self._count for name, field in fields.items()}
+        vertex = dr.arange(mi.UInt32, self._count)
+        columns = [dr.gather(mi.Float, field, vertex * channels[name] + channel)
+                   for name, field in fields.items() for channel in range(channels[name])]
+        shape = (self._count, len(columns))
+        solution = dr.empty(mi.TensorXf, shape=shape)
+        self._solver.solve(mi.TensorXf(dr.ravel(mi.ArrayXf(columns), order="F"), shape), solution)
+        diffused, first = {}, 0
+        for name, count in channels.items():
+            index = dr.arange(mi.UInt32, self._count * count)
+            place = index // count * len(columns) + first + index % count
+            diffused[name] = dr.gather(mi.Float, solution.array, place)
+            first += count
+        return diffused

@@ -94,7 +94,7 @@ class FitConfig:
     """Holes and islands smaller than this fraction of the template's area are noise and are undone."""
 
     # --- carving: folds and hollows that the hull bridges
-    carving_iterations: int = 500
+    carving_iterations: int = 1000
     """Steps of the radiance volume; 0 leaves the hull as it is."""
     carving_batch: int = 65536
     """Pixels per step, drawn over all views; those whose rays miss the hull cost little."""

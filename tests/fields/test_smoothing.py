@@ -5,11 +5,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scipy.sparse as sp
+import trimesh
 from scipy.ndimage import binary_dilation
 from scipy.sparse.linalg import spsolve
 
 from gshell_mi.fields import smoothing
-from gshell_mi.fields.smoothing import LatticeDiffusion
+from gshell_mi.fields.smoothing import LatticeDiffusion, MeshDiffusion
 from gshell_mi.lattice import BlockLattice, Lattice, TetLattice, make_lattice
 from gshell_mi.lattice.sign_scan import active_cells, vertices_near
 
@@ -202,3 +203,21 @@ def test_near_cells_it_is_the_same_but_near_the_edge():
     inner = vertices_near(cells, lattice, smoothing.NEAR - iterations).numpy()
     assert len(inner) > 1000
     np.testing.assert_array_equal(limited[inner], whole[inner])
+
+
+def test_a_mesh_is_solved_exactly_and_all_fields_together():
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    count, (start, end) = len(sphere.vertices), sphere.edges_unique.T
+    adjacency = sp.coo_matrix((np.ones(len(start)), (start, end)), shape=(count, count))
+    system = sp.eye(count) + 7.0 * sp.csgraph.laplacian(adjacency + adjacency.T)
+    diffuse = MeshDiffusion(sphere.faces, count, 7.0)
+    random = np.random.default_rng(0)
+    fields = {name: random.normal(size=(count, channels)).astype(np.float32)
+              for name, channels in (("logit", 1), ("front", 3), ("back", 3), ("gloss", 1), ("pair", 2))}
+    given = {name: mi.Float(field.ravel()) for name, field in fields.items()}
+    together = diffuse.together(given)
+    assert list(together) == list(fields)
+    for name, field in fields.items():
+        exact = spsolve(system.tocsc(), field).reshape(field.shape)
+        np.testing.assert_allclose(together[name].numpy().reshape(field.shape), exact, atol=1e-5)
+        np.testing.assert_array_equal(together[name].numpy(), diffuse(given[name]).numpy())

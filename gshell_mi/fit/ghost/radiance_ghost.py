@@ -203,12 +203,12 @@ class RadianceGhost:
         rates = dict.fromkeys(("opacity", *SIDES), 0.0) | dict.fromkeys(names, rate)
         if self.glossy:
             rates |= dict.fromkeys((*PER_VERTEX, *SHARED), _LOBE_RATE * rate)
-        for name, value in rates.items():
+        gradients = {name: dr.grad(self.optimizer[name]) for name, value in rates.items() if value}
+        gradients |= self._smooth.together({name: gradient for name, gradient in gradients.items()
+                                            if name not in SHARED})
+        for name in rates:
             parameter = self.optimizer[name]
-            gradient = dr.grad(parameter) if value else dr.zeros(mi.Float, dr.width(parameter))
-            if value and name not in SHARED:
-                gradient = self._smooth(gradient)
-            dr.set_grad(parameter, gradient)
+            dr.set_grad(parameter, gradients.get(name, dr.zeros(mi.Float, dr.width(parameter))))
         self.optimizer.set_learning_rate(rates)
         self.optimizer.step()
 
@@ -266,6 +266,8 @@ class RadianceGhost:
             direction: of the rays.
         """
         opacity = self.optimizer["opacity"]
+        if self._opacity_rests:
+            opacity = dr.detach(opacity)  # its derivatives would take as long as those of the radiance
         radiance, transmittance = mi.Color3f(0), mi.Float(1)
         for sheet in sheets:
             hit, face, weights, is_front = sheet
