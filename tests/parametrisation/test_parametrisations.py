@@ -192,3 +192,19 @@ def test_a_rim_moves_where_it_hardly_shows_and_a_surface_goes_by_what_shows_most
     moved = {name: np.abs(made.fields()[name].numpy() - before[name]) / lattice.spacing for name in names}
     np.testing.assert_allclose(moved["sdf"][[100, 300, 400]], [0.08, 0.0008, 0], rtol=0.01, atol=1e-6)
     np.testing.assert_allclose(moved["msdf"][[100, 300, 400]], [0.24, 0.024, 0], rtol=0.01, atol=1e-6)
+
+
+def test_steps_fall_tenfold_and_those_of_a_rim_a_hundredfold():
+    lattice, names = TetLattice(8), ("sdf", "msdf")
+    pull = np.zeros(lattice.vertex_count, np.float32)
+    pull[300] = 1
+    first = {}
+    for progress, fallen in ((0.0, {"sdf": 1, "msdf": 1}), (1.0, {"sdf": 0.1, "msdf": 0.01})):
+        made = make_parametrisation("explicit", bowl(lattice), lattice,
+                                    StepRules(0.1, 0.2, 0.02, smoothing=0.0, detail=0.0))
+        before = made.fields()
+        made.step({name: mi.Float(pull) for name in names}, progress)
+        moved = {name: abs(made.fields()[name][300] - before[name][300]) for name in names}
+        first = first or moved
+        for name in names:
+            assert moved[name] == pytest.approx(fallen[name] * first[name], rel=0.01)
