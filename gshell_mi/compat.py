@@ -66,6 +66,14 @@ def write_mesh(mesh: Any, positions: Any, faces: Any, normals: Any = None, **att
     return params.update()
 
 
+def write_attributes(mesh: Any, **attributes: Any) -> list[str]:
+    """Replaces attributes that a mesh has, flat ``mi.Float`` each, and nothing else of it."""
+    params = mi.traverse(mesh)
+    for name, values in attributes.items():
+        params[name] = values
+    return params.update()
+
+
 def drop_vertex_normals(mesh: Any) -> None:
     """Leaves a mesh without vertex normals, so that it is shaded with those of its faces."""
     params = mi.traverse(mesh)

@@ -107,7 +107,8 @@ class GShell(mi.Mesh):
         if not keys or any(key in _FIELDS for key in keys):
             self._extract()
         elif any(key.startswith(_LATTICE_PREFIX) for key in keys):
-            self._write()
+            # The mesh stays, and so does the structure that rays are traced with.
+            compat.write_attributes(self, **self._mesh_attributes(_Padding(self.surface.vertex_count)))
         else:
             super().parameters_changed(keys)
 
@@ -235,17 +236,19 @@ class GShell(mi.Mesh):
         normals = None
         if self.has_vertex_normals():
             normals = dr.ravel(vertices.apply(surface.vertex_normals()))
-        attributes = {
-            name: dr.ravel(vertices.apply(surface.interpolate(field, channels)))
-            for name, (field, channels) in self._attributes.items()
-        }
         compat.write_mesh(
             self,
             dr.ravel(vertices.apply(surface.vertices)),
             dr.ravel(faces.apply(surface.faces, fill_with_zero=True)),
             normals,
-            **attributes,
+            **self._mesh_attributes(vertices),
         )
+
+    def _mesh_attributes(self, vertices: "_Padding") -> dict[str, Any]:
+        return {
+            name: dr.ravel(vertices.apply(self.surface.interpolate(field, channels)))
+            for name, (field, channels) in self._attributes.items()
+        }
 
     def to_string(self) -> str:
         return (
