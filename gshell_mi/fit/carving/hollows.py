@@ -16,8 +16,8 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 #: Optical depth per cell at which a cut costs 1 / e of what it does in empty space, and the least cost.
 _DEPTH, _LEAST = 0.4, 0.03
 
-#: What it costs to leave outside a vertex that is opaque or not seen.
-_HIDDEN = 0.6
+#: What it costs to leave outside a vertex that is opaque or not seen: as much as one cut in empty space.
+_HIDDEN = 1.0
 
 #: A vertex is seen if this fraction of the rays that come near reach it ...
 SEEN = 0.03
