@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -55,30 +56,24 @@ def write_mesh(mesh: Any, positions: Any, faces: Any, normals: Any = None, **att
         faces: flat ``mi.UInt32`` of 3 indices per face.
         attributes: flat ``mi.Float`` per attribute that the mesh has.
     """
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = positions
-    params["faces"] = faces
+    values = {"vertex_positions": positions, "faces": faces}
     if normals is not None:
         # Given in the same update, they replace those that Mitsuba would compute.
-        params["vertex_normals"] = normals
-    for name, values in attributes.items():
-        params[name] = values
-    return params.update()
+        values["vertex_normals"] = normals
+    return write_parameters(mesh, values | attributes)
 
 
-def write_attributes(mesh: Any, **attributes: Any) -> list[str]:
-    """Replaces attributes that a mesh has, flat ``mi.Float`` each, and nothing else of it."""
-    params = mi.traverse(mesh)
-    for name, values in attributes.items():
-        params[name] = values
+def write_parameters(node: Any, values: Mapping[str, Any]) -> list[str]:
+    """Replaces those parameters of a mesh or scene that are named, and lets it update itself."""
+    params = mi.traverse(node)
+    for name, value in values.items():
+        params[name] = value
     return params.update()
 
 
 def drop_vertex_normals(mesh: Any) -> None:
     """Leaves a mesh without vertex normals, so that it is shaded with those of its faces."""
-    params = mi.traverse(mesh)
-    params["vertex_normals"] = mi.Float([])
-    params.update()
+    write_parameters(mesh, {"vertex_normals": mi.Float([])})
 
 
 def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> mi.Mesh:
@@ -102,9 +97,7 @@ def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> mi.Scene:
 
 def move_mesh(scene: mi.Scene, positions: mi.Float) -> None:
     """Puts the vertices of a ``mesh_scene`` elsewhere: (3 V,) positions, x0, y0, z0, x1, ..."""
-    params = mi.traverse(scene)
-    params["group.mesh.vertex_positions"] = positions
-    params.update()
+    write_parameters(scene, {"group.mesh.vertex_positions": positions})
 
 
 def write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:

@@ -108,7 +108,7 @@ class GShell(mi.Mesh):
             self._extract()
         elif any(key.startswith(_LATTICE_PREFIX) for key in keys):
             # The mesh stays, and so does the structure that rays are traced with.
-            compat.write_attributes(self, **self._mesh_attributes(_Padding(self.surface.vertex_count)))
+            compat.write_parameters(self, self._mesh_attributes(_Padding(self.surface.vertex_count)))
         else:
             super().parameters_changed(keys)
 

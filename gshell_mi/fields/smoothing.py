@@ -177,6 +177,8 @@ class MeshDiffusion:
 
     def together(self, fields: Mapping[str, mi.Float]) -> dict[str, mi.Float]:
         """The same of several fields at once: four columns are solved for in the time of one."""
+        if not fields:
+            return {}
         channels = {name: dr.width(field) // self._count for name, field in fields.items()}
         vertex = dr.arange(mi.UInt32, self._count)
         columns = [dr.gather(mi.Float, field, vertex * channels[name] + channel)

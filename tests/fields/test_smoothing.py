@@ -216,7 +216,7 @@ def test_a_mesh_is_solved_exactly_and_all_fields_together():
               for name, channels in (("logit", 1), ("front", 3), ("back", 3), ("gloss", 1), ("pair", 2))}
     given = {name: mi.Float(field.ravel()) for name, field in fields.items()}
     together = diffuse.together(given)
-    assert list(together) == list(fields)
+    assert list(together) == list(fields) and diffuse.together({}) == {}
     for name, field in fields.items():
         exact = spsolve(system.tocsc(), field).reshape(field.shape)
         np.testing.assert_allclose(together[name].numpy().reshape(field.shape), exact, atol=1e-5)
