@@ -202,12 +202,14 @@ def test_killed_and_resumed(bowl_scene, whole, tmp_path):
     assert fit(bowl_scene, killed, "--resume") == 0
     assert steps(killed) == steps(whole), "no step is missing and none is logged twice"
 
-    # Sums over threads depend on their order, and rounding grows tenfold with every step once the joint stage
-    # moves the geometry: of two whole runs, losses agree to 1e-5 at first and to a few per cent at the end.
-    firm = [step for step in steps(whole) if step[0] != "joint" or step[1] <= 3]
+    # Sums over threads depend on their order, and rounding that turns the sign of a residual turns its L1
+    # gradient. Where vertices move, differences grow tenfold with every step. Two whole runs agree to 1e-5
+    # before; to 2 % in the refinement; in the joint stage to 1e-4 at first, a few per cent at the end.
     expected, found = (np.array([step["loss"] for step in log(output)]) for output in (whole, killed))
-    np.testing.assert_allclose(found[:len(firm)], expected[:len(firm)], rtol=1e-3)
-    np.testing.assert_allclose(found, expected, rtol=0.2)
+    tolerance = {"ghost": 1e-3, "carving": 1e-3, "refinement": 0.06, "joint": 0.2}
+    allowed = [1e-3 if stage == "joint" and iteration <= 2 else tolerance[stage]
+               for stage, iteration in steps(whole)]
+    np.testing.assert_array_less(np.abs(found / expected - 1), allowed)
 
 
 def test_asset_and_report_come_with_a_fit(bowl_scene, tmp_path):
