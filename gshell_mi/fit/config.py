@@ -16,7 +16,7 @@ _LEAST = {"resolution": 4, "start_resolution": 4, "band_resolution": 4, "triptyc
 
 #: Greatest sensible value, where there is one.
 _MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "unseen_area": 1, "warmup": 1,
-         "color_hold": 1, "reparam_depth": 3}
+         "color_hold": 1, "widening": 1, "reparam_depth": 3}
 
 #: What the detail stage takes of the first steps of the joint stage for material and light.
 _CALMER = 0.3
@@ -24,7 +24,8 @@ _CALMER = 0.3
 #: What ``--preview`` has instead: less of everything, but for the steps that openings need.
 _PREVIEW = {"resolution": 48, "ghost_iterations": 600, "ghost_batch": 16384, "carving_iterations": 0,
             "refinement_iterations": 0, "iterations": 70, "primal_spp": 4, "max_depth": 2,
-            "color_hold": 0, "even_start": False, "light_height": 16, "triptychs": 4}
+            "color_hold": 0, "even_start": False, "light_height": 16, "widening": 1,
+            "triptychs": 4}
 
 
 @dataclass(frozen=True)
@@ -167,6 +168,12 @@ class FitConfig:
     reparam_depth: int = 1
     """Path segments whose visibility is differentiated: 1 is what the camera sees, 2 adds shadows. Shapes
     come out the same with either, a dress with deep folds 0.2 dB better with 2, and 1 is faster."""
+    widening: float = 0.5
+    """Fraction of the steps after which openings grow where what is behind the surface beside them explains
+    the images about as well; 1 leaves it out. Only if --field is explicit."""
+    widening_gain: float = 1.0
+    """Such growth stays if, after half of the remaining steps, the squared image error there is below this
+    fraction of what it was, and of what the rest of the surface has gained meanwhile."""
     geometry_lr: float = 0.08
     """Largest change of sdf per step, in cells; of the mSDF too if --field is not explicit."""
     msdf_lr: float = 0.24
@@ -242,6 +249,7 @@ class FitConfig:
     def for_detail(self) -> FitConfig:
         """The settings of the joint stage as those of the detail stage, which begins where that has ended."""
         return replace(self, iterations=self.detail_iterations, warmup=0, color_hold=0,
+                       widening=1,
                        material_lr=_CALMER * self.material_lr, light_lr=_CALMER * self.light_lr)
 
     @property

@@ -45,6 +45,9 @@ class ExplicitGrid(Parametrisation):
         return {name: mi.Float(dr.detach(optimizer[name]))
                 for optimizer in self.optimizers.values() for name in optimizer.keys()}
 
+    def replace(self, name: str, field: mi.Float) -> None:
+        self._optimizer_of(name)[name] = field
+
     def carry(self, carried: Carried) -> None:
         for optimizer in self.optimizers.values():
             carried.optimizer(optimizer, tuple(optimizer.keys()))

@@ -57,6 +57,10 @@ class Parametrisation(ABC):
     def fields(self) -> dict[str, mi.Float]:
         """The present fields, detached."""
 
+    def replace(self, name: str, field: mi.Float) -> None:
+        """Gives a field other values. Only where the values themselves are the parameters."""
+        raise NotImplementedError
+
     @abstractmethod
     def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
              diffuse: LatticeDiffusion | None = None) -> None:

@@ -59,7 +59,7 @@ class JointStage:
         self._sees_masks = all(target.has_alpha for target in fit.targets) and not config.geometry_only
         if config.geometry_only:
             self.subject.shade_flat()
-        self._integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
+        self.integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
                                          "gradient_depth": config.gradient_depth,
                                          "reparam_depth": config.reparam_depth, "hide_emitters": True})
         resting = {"msdf"} if config.watertight else set()
@@ -94,12 +94,12 @@ class JointStage:
         given = not (self.material_optimizer.state or self.light_optimizer.state)
         moving = given or iteration >= config.warmup * config.iterations
         with phase("scene update"):
-            self._apply(geometry=moving)
+            self.apply(geometry=moving)
         index = self._view(iteration)
-        seed = (config.seed * _SEEDS_APART + 2 * iteration) % 2**32
+        seed = self.seed(iteration)
         with phase("render") as compute:
             image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[index],
-                              integrator=self._integrator, spp=config.primal_spp, spp_grad=config.spp,
+                              integrator=self.integrator, spp=config.primal_spp, spp_grad=config.spp,
                               seed=seed, seed_grad=seed + 1)
             compute(image)
         target = self._targets[index]
@@ -127,9 +127,13 @@ class JointStage:
                 **{name: value[0] for name, value in terms.items()},
                 "psnr": decibels(error[0])}
 
+    def seed(self, iteration: int) -> int:
+        """Of the samples of a step; the next number is that of its gradient's."""
+        return (self.config.seed * _SEEDS_APART + 2 * iteration) % 2**32
+
     def finish(self) -> None:
         """Leaves the last step's parameters in the scene, without what noise has cut out or left floating."""
-        self._apply(geometry=True)
+        self.apply(geometry=True)
         subject = self.subject
         self.parameters["subject.msdf"] = without_specks(subject.msdf, subject.template(), subject.lattice,
                                                          self.config.ghost_min_area)
@@ -157,8 +161,8 @@ class JointStage:
         order = np.random.default_rng((self.config.seed, iteration // count)).permutation(count)
         return int(order[iteration % count])
 
-    def _apply(self, *, geometry: bool) -> None:
-        """Puts the optimised fields into the scene, with gradients enabled."""
+    def apply(self, *, geometry: bool) -> None:
+        """Puts what is optimised into the scene, with gradients enabled; the geometry only if asked."""
         if geometry:
             self.fields = self.geometry.fields()
             dr.enable_grad(self.fields)

@@ -1,0 +1,229 @@
+"""Openings grow where the light explains what lies behind the surface beside them."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cap import cap
+
+from gshell_mi.fields import LatticeFields, sphere
+from gshell_mi.fields.smoothing import MeshDiffusion
+from gshell_mi.fit import FitConfig
+from gshell_mi.fit.ghost.pixels import PixelPool
+from gshell_mi.fit.joint import widening
+from gshell_mi.fit.joint.seen_through import Explained, explained
+from gshell_mi.fit.joint.widening import Widening, beside_openings, grown
+from gshell_mi.lattice import TetLattice
+from gshell_mi.targets import Target
+from gshell_mi.topology import topology
+from gshell_mi.triangles import positive_part
+from gshell_mi.views import PinholeViews
+
+LATTICE, RADIUS = TetLattice(20), 0.6
+
+
+def loops(ball, opened) -> tuple[int, int]:
+    found = topology(*positive_part(ball.vertices, ball.faces, np.where(opened, -1.0, 1.0)))
+    return found.boundary_loops, found.components
+
+
+# --- growing
+
+
+def test_an_opening_grows_to_where_it_may(ball):
+    up, allowed = cap(ball, [0, 0, 1], 0.1), cap(ball, [0, 0, 1], 0.4)
+    np.testing.assert_array_equal(grown(up, allowed, ball.vertices[:, 0], ball.faces), allowed)
+
+
+def test_openings_that_grow_do_not_meet(ball):
+    """Wherever else they may go, a strip stays between them, so there are two loops for ever."""
+    start = cap(ball, [0, 0, 1], 0.1) | cap(ball, [1, 0, 0], 0.1)
+    allowed = ~cap(ball, [0, 0, -1], 0.3)
+    assert loops(ball, allowed) == (1, 1)
+    result = grown(start, allowed, ball.vertices[:, 1], ball.faces)
+    assert loops(ball, result) == loops(ball, start) == (2, 1)
+    assert (allowed & ~result).sum() < 0.05 * len(result)
+
+
+def test_what_an_opening_surrounds_is_not_cut_off(ball):
+    """It may grow around the equator, but not all around."""
+    start = cap(ball, [1, 0, 0], 0.02)
+    allowed = start | (np.abs(ball.vertices[:, 2]) < 0.15)
+    assert loops(ball, allowed) == (2, 2)
+    result = grown(start, allowed, np.zeros(len(start)), ball.faces)
+    assert loops(ball, result) == (1, 1)
+    assert result.sum() > 0.9 * allowed.sum()
+
+
+# --- where
+
+
+def evidence(ball, empty: np.ndarray) -> Explained:
+    """The surface is explained badly where it is empty, and then what is behind it hardly worse."""
+    now = np.where(empty, 4.0, 1.0)
+    return Explained(np.full(len(empty), 50.0), 50 * now, 50 * np.where(empty, 6.0, 40.0))
+
+
+def test_openings_grow_into_what_is_empty_beside_them(ball):
+    """But what is as empty elsewhere stays: how many openings there are, others have decided."""
+    up, wide, down = (cap(ball, [0, 0, z], share) for z, share in ((1, 0.05), (1, 0.15), (-1, 0.1)))
+    values, smooth = np.where(up, -1.0, 1.0), MeshDiffusion(ball.faces, len(up), 0.5)
+    added = beside_openings(values, ball.faces, evidence(ball, wide | down), smooth)
+    assert not (added & (up | down)).any()
+    np.testing.assert_array_equal(added[~up & cap(ball, [0, 0, 1], 0.13)], True)
+    assert not added[~cap(ball, [0, 0, 1], 0.18)].any()
+
+
+@pytest.mark.parametrize("change", ["explained as well as the rest", "much worse without", "not met"])
+def test_what_is_not_clearly_empty_stays(ball, change):
+    up, wide = cap(ball, [0, 0, 1], 0.05), cap(ball, [0, 0, 1], 0.15)
+    found = evidence(ball, wide)
+    found = {"explained as well as the rest": replace(found, now=found.rays, without=2 * found.rays),
+             "much worse without": replace(found, without=np.where(wide, 20 * found.now, found.without)),
+             "not met": Explained(*(np.where(wide, 0.01, 1) * sums
+                                    for sums in (found.rays, found.now, found.without)))}[change]
+    smooth = MeshDiffusion(ball.faces, len(up), 0.5)
+    assert not beside_openings(np.where(up, -1.0, 1.0), ball.faces, found, smooth).any()
+
+
+# --- the evidence
+
+
+def half_ball(top: float) -> LatticeFields:
+    """A half-ball below y = 0 with a lid; the lid is open but for a rim of the width ``top``."""
+    x, y, z = LATTICE.vertex_positions().T
+    sdf = np.maximum(np.sqrt(x * x + y * y + z * z) - RADIUS, y + 0.01)
+    closed = LatticeFields.closed(sdf.astype(np.float32), "tet")
+    msdf = np.where(y < -0.12, 1.0, np.hypot(x, z) - (RADIUS - top))
+    return replace(closed, msdf=(msdf if top < RADIUS else np.ones_like(msdf)).astype(np.float32))
+
+
+def test_what_is_left_of_a_lid_is_explained_by_what_is_behind_it():
+    """Targets show an open bowl in the light and the material that the scene has. Light that comes in through
+    the middle of the lid tells what is behind its rim."""
+    subject = mi.load_dict({"type": "gshell", "resolution": LATTICE.resolution,
+                            "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}})
+    scene = mi.load_dict({"type": "scene", "subject": subject, "light": {"type": "constant"}})
+    sensors = [mi.load_dict({
+        "type": "perspective", "fov": 30, "film": {"type": "hdrfilm", "width": 48, "height": 48,
+                                                   "pixel_format": "rgba", "rfilter": {"type": "box"}},
+        "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 0, 1])})
+        for origin in ([0.5, 3, 0.5], [0.5, -3, 0.5])]
+    integrator = mi.load_dict({"type": "gshell_path", "max_depth": 4, "hide_emitters": True})
+
+    def show(fields):
+        subject.set_fields(fields)
+        scene.parameters_changed()
+
+    show(half_ball(0.06))
+    images = (mi.render(scene, sensor=sensor, integrator=integrator, spp=1024) for sensor in sensors)
+    targets = [Target(Path(), np.array(image), True) for image in images]
+    show(half_ball(0.22))
+    views, template = PinholeViews.from_sensors(sensors), subject.template()
+    found = explained(template, scene, integrator, views, PixelPool(views, targets), seed=1)
+    x, y, z = template.to_numpy()[0].T
+    lid = (y > -0.05) & (np.hypot(x, z) > 0.4) & (np.hypot(x, z) < 0.5)
+    now, without = (np.array([sums[part].sum() / found.rays[part].sum() for part in (lid, y < -0.2)])
+                    for sums in (found.now, found.without))
+    # The lid is lit by all of the sky, the inside by a part of it; the outside is as its targets show it.
+    assert 0 < without[0] < 0.7 * now[0]
+    assert abs(now[1]) < 0.02 * without[1]
+
+
+# --- the worker
+
+
+class StillJoint:
+    """A joint stage whose steps change nothing."""
+
+    def __init__(self, config: FitConfig):
+        self.config = config
+        self.subject = mi.load_dict({"type": "gshell", "resolution": LATTICE.resolution})
+        fields = sphere(LATTICE, RADIUS)
+        self.subject.set_fields(replace(fields, msdf=(0.45 - fields.lattice.vertex_positions()[:, 2])
+                                        .astype(np.float32)))
+        self.geometry = SimpleNamespace(replace=self._replace)
+        self.scene = self.integrator = None
+
+    def _replace(self, name, field):
+        assert name == "msdf"
+        self.subject.msdf = field
+
+    def apply(self, geometry):
+        fields = self.subject.fields()
+        self.subject.set_fields(fields)
+
+    finish = step = lambda self, iteration=0: self.apply(geometry=True) or {}
+
+    def seed(self, iteration):
+        return iteration
+
+    def height(self) -> float:
+        """Of the surface's highest point, which is on its rim."""
+        self.apply(geometry=True)
+        vertices, _, _ = self.subject.surface.to_numpy()
+        return float(vertices[:, 2].max())
+
+    def loops(self) -> int:
+        vertices, faces, _ = self.subject.surface.to_numpy()
+        return topology(vertices, faces).boundary_loops
+
+
+@pytest.fixture
+def evidence_above(monkeypatch):
+    """Says that there is nothing above z = 0.2; in what follows the images are explained by ``later``."""
+    said = {"later": 1.0}
+
+    def fake(template, scene, integrator, views, pixels, seed):
+        z = template.to_numpy()[0][:, 2]
+        empty = z > 0.2
+        rays = np.full(len(z), 50.0)
+        now = np.where(empty, 4.0 * (said["later"] if seed else 1.0), 1.0)
+        return Explained(rays, rays * now, rays * np.where(empty, 6.0, 40.0))
+
+    monkeypatch.setattr(widening, "explained", fake)
+    return said
+
+
+CONFIG = FitConfig(iterations=8, widening=0.0, widening_gain=0.9)
+
+
+def run(joint: StillJoint, steps: range, state: dict | None = None) -> Widening:
+    worker = Widening(joint, None, None, state or {})
+    for iteration in steps:
+        worker.step(iteration)
+    return worker
+
+
+@pytest.mark.parametrize(("later", "height"), [(0.5, 0.2), (0.95, 0.45)])
+def test_growth_stays_if_the_images_are_explained_better(evidence_above, later, height):
+    evidence_above["later"] = later
+    joint = StillJoint(CONFIG)
+    worker = run(joint, range(1))
+    assert joint.height() == pytest.approx(0.2, abs=1.5 * LATTICE.spacing), "opened at first, either way"
+    # A fit that was interrupted goes on with what the checkpoint kept.
+    worker = run(joint, range(1, 8), worker.state())
+    assert worker.finish() is (height < 0.4)
+    assert joint.height() == pytest.approx(height, abs=1.5 * LATTICE.spacing)
+    assert joint.loops() == 1
+
+
+def test_growth_that_led_to_other_loops_is_taken_back(evidence_above):
+    evidence_above["later"] = 0.5
+    joint = StillJoint(CONFIG)
+    worker = run(joint, range(8))
+    below = LATTICE.vertex_positions()[:, 2] + 0.4
+    joint.geometry.replace("msdf", mi.Float(np.minimum(joint.subject.msdf.numpy(), below).astype(np.float32)))
+    assert worker.finish() is False
+    assert joint.height() == pytest.approx(0.45, abs=1.5 * LATTICE.spacing)
+
+
+@pytest.mark.parametrize("settings", [{"widening": 1.0}, {"watertight": True}, {"field": "hashgrid"}])
+def test_modes_without_it(evidence_above, settings):
+    joint = StillJoint(replace(CONFIG, **settings))
+    worker = run(joint, range(8))
+    assert worker.finish() is None and not worker.state()
+    assert joint.height() == pytest.approx(0.45, abs=LATTICE.spacing)
