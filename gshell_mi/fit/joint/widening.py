@@ -73,10 +73,11 @@ class Widening:
                  state: Mapping[str, np.ndarray]):
         self.joint, self._views, self._pixels = joint, views, pixels
         config, count = joint.config, joint.config.iterations
-        wanted = config.widening < 1 and config.field == "explicit" and not config.watertight
         #: The steps before which openings grow and are judged.
-        self._opens = round(config.widening * count) if wanted else count
+        self._opens = round(config.widening * count)
         self._judges = (self._opens + count + 1) // 2
+        if config.field != "explicit" or config.watertight or self._judges >= count:
+            self._opens = count     # never
         self._state = {name: array for name, array in state.items() if name.startswith(_PREFIX)}
 
     def step(self, iteration: int) -> Mapping[str, float]:

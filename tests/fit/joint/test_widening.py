@@ -221,9 +221,10 @@ def test_growth_that_led_to_other_loops_is_taken_back(evidence_above):
     assert joint.height() == pytest.approx(0.45, abs=1.5 * LATTICE.spacing)
 
 
-@pytest.mark.parametrize("settings", [{"widening": 1.0}, {"watertight": True}, {"field": "hashgrid"}])
+@pytest.mark.parametrize("settings", [{"widening": 1.0}, {"watertight": True}, {"field": "hashgrid"},
+                                      {"iterations": 1}])
 def test_modes_without_it(evidence_above, settings):
     joint = StillJoint(replace(CONFIG, **settings))
-    worker = run(joint, range(8))
+    worker = run(joint, range(joint.config.iterations))
     assert worker.finish() is None and not worker.state()
     assert joint.height() == pytest.approx(0.45, abs=LATTICE.spacing)
