@@ -123,7 +123,7 @@ def test_the_loss_is_the_difference_in_cells(scene):
     """A sphere too small by half a cell, 0.05; along the rays that is 0.05 / cos, in the median 0.07."""
     fit = load_fit_scene(scene)
     joint = stage(fit, RADIUS - 0.05)
-    joint._apply(geometry=True)
+    joint.apply(geometry=True)
     _, terms = joint._regularisers(8)
     assert terms["joint_depth"][0] == pytest.approx(0.5, abs=0.05)
     without = joint._regularisers(2)[1]["joint_depth"]
@@ -137,7 +137,7 @@ def test_the_derivative_moves_the_surface_towards_the_map(scene):
     fit = load_fit_scene(scene)
 
     joint = stage(fit, RADIUS - 0.05)
-    joint._apply(geometry=True)
+    joint.apply(geometry=True)
     dr.backward(joint._regularisers(8)[1]["joint_depth"])
     assert -dr.sum(dr.grad(joint.fields["sdf"]))[0] == pytest.approx(-10, rel=0.03)
 
