@@ -91,6 +91,18 @@ def vertex_components(edges: np.ndarray, vertex_count: int) -> tuple[int, np.nda
     return connected_components(graph, directed=False)
 
 
+def spread(chosen: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """(V,) vertices that are chosen (V,) or joined to such a one by one of the (E, 2) edges.
+
+    >>> spread(np.array([True, False, False]), np.array([[0, 1], [1, 2]])).tolist()
+    [True, True, False]
+    """
+    result = chosen.copy()
+    for here, there in (edges.T, edges.T[::-1]):
+        result[here[chosen[there]]] = True
+    return result
+
+
 def mesh_components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
     """(V,) ids of the connected components of a mesh with (F, 3) faces.
 

@@ -248,8 +248,7 @@ class FitConfig:
 
     def for_detail(self) -> FitConfig:
         """The settings of the joint stage as those of the detail stage, which begins where that has ended."""
-        return replace(self, iterations=self.detail_iterations, warmup=0, color_hold=0,
-                       widening=1,
+        return replace(self, iterations=self.detail_iterations, warmup=0, color_hold=0, widening=1,
                        material_lr=_CALMER * self.material_lr, light_lr=_CALMER * self.light_lr)
 
     @property

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...topology import equal_patches, mesh_edges, patch_sizes, vertex_components
+from ...topology import equal_patches, mesh_edges, patch_sizes, spread, vertex_components
 
 #: Openings are parted where they are at most twice this many vertices wide.
 _NECK = 2
@@ -90,12 +90,12 @@ def _lobes(opened: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V,) ids of the connected patches of equal label, those that are open split at their necks."""
     edges, _ = mesh_edges(faces)
     here, there = np.concatenate([edges, edges[:, ::-1]]).T
-    core = opened.copy()
+    core = opened
     for _ in range(_NECK):
-        core[here[~core[there]]] = False
+        core = ~spread(~core, edges)
     patch = equal_patches(opened, faces)
     # Patches without a core are whole.
-    core |= opened & (np.bincount(patch, core) == 0)[patch]
+    core = core | opened & (np.bincount(patch, core) == 0)[patch]
     lobe = np.where(core, 1 + vertex_components(edges[core[edges].all(axis=1)], len(opened))[1], 0)
     while True:
         front = (lobe[here] == 0) & (lobe[there] > 0) & opened[here]

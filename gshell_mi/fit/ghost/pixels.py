@@ -11,6 +11,9 @@ import numpy as np
 from ...targets import Target
 from ...views import PinholeViews
 
+#: Coverage of a pixel from which on nothing of the background is in it.
+COVERED = 0.99
+
 
 @dataclass(frozen=True)
 class PixelSample:

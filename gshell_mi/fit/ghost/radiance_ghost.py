@@ -27,7 +27,7 @@ from ..config import FitConfig
 from .contrast import Contrast
 from .glossy_lobe import PER_VERTEX, SHARED, initial_lobe, mirrored_radiance
 from .mesh_normals import vertex_normals
-from .pixels import PixelPool, PixelSample
+from .pixels import COVERED, PixelPool, PixelSample
 
 #: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
 #: enough that all are seen; colours fitted at full opacity would bleed what is inside into the caps.
@@ -47,9 +47,6 @@ _REFIT_STEPS, _ERROR_STEPS = 40, 20
 
 #: Refits of a ghost that has not learnt anything yet.
 _ROUNDS_FROM_GREY = 3
-
-#: Coverage of a pixel from which on nothing of the background is in it.
-_COVERED = 0.99
 
 #: Random pixels of these steps must not depend on how many training steps came before.
 _EXTRA_STEP = 1 << 20
@@ -150,7 +147,7 @@ class RadianceGhost:
                 sample, radiance, _, sheets = self._render(_EXTRA_STEP + _REFIT_STEPS + step)
                 difference = dr.abs(self._tone(radiance) - self._tone(sample.radiance))
                 hit, face, weights, _ = sheets[0]
-                for total, counts in zip(sums, (hit, hit & (sample.alpha > _COVERED)), strict=True):
+                for total, counts in zip(sums, (hit, hit & (sample.alpha > COVERED)), strict=True):
                     for corner in range(3):
                         share = weights[corner] * (difference.x + difference.y + difference.z)
                         dr.scatter_reduce(dr.ReduceOp.Add, total, share, face[corner], counts)

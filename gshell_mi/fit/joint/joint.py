@@ -60,8 +60,8 @@ class JointStage:
         if config.geometry_only:
             self.subject.shade_flat()
         self.integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
-                                         "gradient_depth": config.gradient_depth,
-                                         "reparam_depth": config.reparam_depth, "hide_emitters": True})
+                                        "gradient_depth": config.gradient_depth,
+                                        "reparam_depth": config.reparam_depth, "hide_emitters": True})
         resting = {"msdf"} if config.watertight else set()
         if not config.flexicubes_weights:
             resting.add("weights")

@@ -16,7 +16,7 @@ import numpy as np
 from ...compat import mesh_scene
 from ...extraction.surface_mesh import SurfaceMesh
 from ...views import PinholeViews
-from ..ghost.pixels import PixelPool
+from ..ghost.pixels import COVERED, PixelPool
 
 #: Pixels per batch, and batches.
 _BATCH, _BATCHES = 65536, 24
@@ -30,9 +30,6 @@ _BRIGHTEST = 4.0
 
 #: Weight of the coverage's squared error.
 _COVERAGE = 3.0
-
-#: Coverage of a pixel from which on nothing of the background is in it.
-_COVERED = 0.99
 
 #: How far behind the template rays go on, as a fraction of its extent.
 _OFFSET = 1e-4
@@ -76,7 +73,7 @@ def explained(template: SurfaceMesh, scene: mi.Scene, integrator, views: Pinhole
             sample = pixels.sample(_BATCH, seed=seed, step=batch)
             ray = views.rays(sample.view, sample.film)
             hit = shell.ray_intersect_preliminary(ray, coherent=False)
-            index = dr.compress(hit.is_valid() & (sample.alpha > _COVERED))
+            index = dr.compress(hit.is_valid() & (sample.alpha > COVERED))
             if dr.width(index) == 0:
                 continue
             origin, direction, distance, prim, uv, target = (

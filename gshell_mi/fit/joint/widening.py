@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from ...extraction.surface_mesh import SurfaceMesh
 from ...fields.smoothing import MeshDiffusion
-from ...topology import equal_patches, mesh_edges, topology
+from ...topology import equal_patches, mesh_edges, spread, topology
 from ...triangles import positive_part
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
@@ -199,14 +199,14 @@ def beside_openings(values: np.ndarray, faces: np.ndarray, found: Explained,
     edges, _ = mesh_edges(faces)
     reached = ~solid | empty
     for _ in range(_GAP):
-        reached = _spread(reached, edges)
+        reached = spread(reached, edges)
     for _ in range(_GAP):
-        reached = ~_spread(~reached, edges)
+        reached = ~spread(~reached, edges)
     ratio = np.where(empty, without / np.maximum(now, 1e-30), _BEHIND)
     blocked = reached & ~grown(~solid, reached, ratio, faces)
     # A rim moves: what parts two rims has to be wide enough to outlast that.
     for _ in range(_WALL):
-        blocked = _spread(blocked, edges)
+        blocked = spread(blocked, edges)
     added = grown(~solid, reached & ~blocked, ratio, faces) & solid
     patch = equal_patches(added, faces)
     return added & (np.bincount(patch)[patch] >= _FEWEST)
@@ -251,14 +251,6 @@ def grown(opened: np.ndarray, allowed: np.ndarray, order: np.ndarray, faces: np.
         first = np.full(len(opened), len(opened))
         np.minimum.at(first, here, np.where(simple, rank, len(opened))[there])
         opened |= simple & (rank < first)
-
-
-def _spread(chosen: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """(V,) vertices that are chosen or have a neighbour that is."""
-    result = chosen.copy()
-    for here, there in (edges.T, edges.T[::-1]):
-        result[here[chosen[there]]] = True
-    return result
 
 
 def _errors(found: Explained, patch: np.ndarray, solid: np.ndarray, count: int | None = None) -> np.ndarray:
