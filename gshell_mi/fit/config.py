@@ -11,12 +11,12 @@ from ..errors import UserError
 
 #: Least sensible value of a number, where that is not 0.
 _LEAST = {"resolution": 4, "start_resolution": 4, "band_resolution": 4, "triptychs": 1, "ghost_iterations": 1,
-          "ghost_batch": 1, "ghost_sheets": 1, "carving_batch": 1, "spp": 1, "primal_spp": 1,
+          "ghost_batch": 1, "ghost_sheets": 1, "carving_batch": 1, "step_views": 1, "spp": 1, "primal_spp": 1,
           "max_depth": 2, "gradient_depth": 2, "reparam_depth": 1, "light_height": 3}
 
 #: Greatest sensible value, where there is one.
 _MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "unseen_area": 1, "warmup": 1,
-         "color_hold": 1, "widening": 1, "reparam_depth": 3}
+         "color_hold": 1, "second_look": 1, "reparam_depth": 3}
 
 #: What the detail stage takes of the first steps of the joint stage for material and light.
 _CALMER = 0.3
@@ -24,7 +24,7 @@ _CALMER = 0.3
 #: What ``--preview`` has instead: less of everything, but for the steps that openings need.
 _PREVIEW = {"resolution": 48, "ghost_iterations": 600, "ghost_batch": 16384, "carving_iterations": 0,
             "refinement_iterations": 0, "iterations": 70, "primal_spp": 4, "max_depth": 2,
-            "color_hold": 0, "even_start": False, "light_height": 16, "widening": 1,
+            "color_hold": 0, "even_start": False, "light_height": 16, "second_look": 1,
             "triptychs": 4}
 
 
@@ -150,11 +150,14 @@ class FitConfig:
     flexicubes_weights: bool = False
     """Also optimise the 21 weights per cube of FlexiCubes, which makes a step slower by a tenth; the hat is
     none the better for it."""
-    iterations: int = 450
-    """Steps of the joint stage; more and noisier ones come closer than fewer with more samples."""
+    iterations: int = 200
+    """Steps of the joint stage."""
+    step_views: int = 3
+    """Views that a step of the joint stage renders; it follows the mean of their losses. What a step takes
+    beside rendering is shared by them."""
     warmup: float = 0.15
     """Fraction of these steps in which only material and light move."""
-    detail_iterations: int = 120
+    detail_iterations: int = 60
     """Steps of the detail stage, which continues the joint stage on a lattice finer than --start-resolution;
     0 runs the joint stage itself on that lattice."""
     spp: int = 2
@@ -168,18 +171,19 @@ class FitConfig:
     reparam_depth: int = 1
     """Path segments whose visibility is differentiated: 1 is what the camera sees, 2 adds shadows. Shapes
     come out the same with either, a dress with deep folds 0.2 dB better with 2, and 1 is faster."""
-    widening: float = 0.5
+    second_look: float = 0.5
     """Fraction of the steps after which openings grow where what is behind the surface beside them explains
-    the images about as well; 1 leaves it out. Only if --field is explicit."""
-    widening_gain: float = 1.0
-    """Such growth stays if, after half of the remaining steps, the squared image error there is below this
+    the images about as well, and small ones are shut that explain them badly; 1 leaves it out. Only if
+    --field is explicit."""
+    second_look_gain: float = 1.0
+    """Such a change stays if, after half of the remaining steps, the squared image error there is below this
     fraction of what it was, and of what the rest of the surface has gained meanwhile."""
-    geometry_lr: float = 0.08
+    geometry_lr: float = 0.14
     """Largest change of sdf per step, in cells; of the mSDF too if --field is not explicit."""
-    msdf_lr: float = 0.24
+    msdf_lr: float = 0.4
     """Largest change of the mSDF per step, in cells; falls a hundredfold. Its steps are halfway between one
     size per vertex and one for all, so that a rim moves where it hardly shows, too."""
-    deform_lr: float = 0.02
+    deform_lr: float = 0.035
     """Largest change of the vertex offsets per step; 1 is the greatest offset allowed."""
     geometry_smoothing: float = 8.0
     """Lambda of the Sobolev gradient (I + lambda L)^-1 on the lattice when the geometry starts to move: whole
@@ -188,7 +192,7 @@ class FitConfig:
     """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
     material_gradient_smoothing: float = 1.0
     """Lambda of the material's Sobolev gradient on the lattice; spreads colour to what few pixels see."""
-    material_lr: float = 0.2
+    material_lr: float = 0.3
     """Adam's step for base colour, roughness and metallic (logits)."""
     color_hold: float = 0.5
     """Fraction of the stage in which the base colour's steps grow from 0 to --material-lr if the light is
@@ -196,7 +200,7 @@ class FitConfig:
     even_start: bool = True
     """Start from one base colour, the median of those that the ghost saw, if the light is sought; otherwise
     from what it saw, shading and all."""
-    light_lr: float = 0.5
+    light_lr: float = 0.75
     """Adam's step for the environment map (logarithm of its radiance) at the texel that is told most."""
     light_height: int = 32
     """Rows of the optimised environment map; it has twice as many columns."""
@@ -248,7 +252,7 @@ class FitConfig:
 
     def for_detail(self) -> FitConfig:
         """The settings of the joint stage as those of the detail stage, which begins where that has ended."""
-        return replace(self, iterations=self.detail_iterations, warmup=0, color_hold=0, widening=1,
+        return replace(self, iterations=self.detail_iterations, warmup=0, color_hold=0, second_look=1,
                        material_lr=_CALMER * self.material_lr, light_lr=_CALMER * self.light_lr)
 
     @property

@@ -47,7 +47,7 @@ from .ghost.radiance_ghost import RadianceGhost
 from .joint.depth import check_depth
 from .joint.field_fitting import FieldFitting
 from .joint.joint import JointStage
-from .joint.widening import Widening
+from .joint.second_look import SecondLook
 from .memory import MemoryEstimate
 from .refinement.rounds import Moved, RefinementRounds
 from .start import (
@@ -354,16 +354,16 @@ class _Fit:
         joint = JointStage(self.scene, start_material(self.scene, start, fields.lattice, config),
                            start_light(self.scene, start, config), config)
         self._fit_field(joint)
-        widening = Widening(joint, self.views, self.pixels, self.checkpoint.arrays)
+        look = SecondLook(joint, self.views, self.pixels, self.checkpoint.arrays)
         if self.checkpoint.stage == name:
-            self.books.iterate(name, config.iterations, widening, joint.optimizers, start,
-                               lambda: widening.state() | block_arrays(self.scene.subject.fields()))
+            self.books.iterate(name, config.iterations, look, joint.optimizers, start,
+                               lambda: look.state() | block_arrays(self.scene.subject.fields()))
         else:
             for optimizer_name, optimizer in joint.optimizers.items():
                 restore_optimizer(optimizer_name, optimizer, self.checkpoint.arrays)
-        widened = widening.finish()
-        if widened is not None:
-            self.checkpoint.facts["openings_widened"] = widened
+        changed = look.finish()
+        if changed is not None:
+            self.checkpoint.facts["openings_changed"] = changed
         if self.checkpoint.stage == name and lattice == self.last_lattice:
             self.books.leave()
         return joint

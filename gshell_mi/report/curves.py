@@ -24,7 +24,7 @@ def curves(log: Path) -> list[str]:
         entry = json.loads(line)
         stage = stages.setdefault(entry["stage"], {})
         for name, value in entry.items():
-            if name not in ("stage", "iteration", "view", "seconds"):
+            if name not in ("stage", "iteration", "seconds"):
                 stage.setdefault(name, []).append((entry["iteration"], value))
     drawings = []
     for stage, series in stages.items():

@@ -60,10 +60,10 @@ def test_it_starts_with_what_the_joint_stage_has_left(bowl_scene, resolution):
 def test_its_rates_are_those_of_what_has_settled():
     before = FitConfig(iterations=260, detail_iterations=7)
     after = before.for_detail()
-    assert (after.iterations, after.warmup, after.color_hold, after.widening) == (7, 0, 0, 1)
+    assert (after.iterations, after.warmup, after.color_hold, after.second_look) == (7, 0, 0, 1)
     assert after.material_lr < before.material_lr and after.light_lr < before.light_lr
     assert replace(after, iterations=260, warmup=before.warmup, color_hold=before.color_hold,
-                   widening=before.widening, material_lr=before.material_lr,
+                   second_look=before.second_look, material_lr=before.material_lr,
                    light_lr=before.light_lr) == before
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from ...fields.smoothing import MeshDiffusion
 from ...topology import Topology, mesh_edges, patch_sizes, topology, vertex_components
 from ...triangles import positive_part
-from ..ghost.opening import also_opened, clean_opacity
+from ..ghost.opening import clean_opacity, reopened
 from .small_sheets import small_sheets
 from .template_sides import normals_at_vertices, opposite_sides
 
@@ -87,7 +87,7 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
     spare, sheets = spare | small, sheets + count
     if not spare.any():
         return None
-    logits, _ = also_opened(cut.logits, spare, smooth)
+    logits, _ = reopened(cut.logits, ~solid | spare, smooth)
     logits[spare] = np.minimum(logits[spare], -_LEAST)
     stays = solid & ~spare & np.isfinite(thickness) & (spare | ~solid)[opposite]
     logits[stays] = np.maximum(logits[stays], _LEAST)

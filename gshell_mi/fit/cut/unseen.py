@@ -11,7 +11,7 @@ from ...fields.smoothing import MeshDiffusion
 from ...triangles import area_vectors, unit
 from ...views import PinholeViews
 from ...visibility import best_view
-from ..ghost.opening import also_opened, clean_opacity, rewritten
+from ..ghost.opening import clean_opacity, reopened, rewritten
 
 #: What is seen at this cosine or less is as good as unseen: a hull ends in surfaces that views only graze.
 _GRAZING = 0.2
@@ -43,5 +43,5 @@ def without_unseen(subject: mi.Shape, fields: LatticeFields, views: PinholeViews
     if not unseen.any():
         return None
     smooth = MeshDiffusion(cells, len(places), _SMOOTHING)
-    cut, near = also_opened(values, unseen, smooth, subject.lattice.spacing)
+    cut, near = reopened(values, (values <= 0) | unseen, smooth, subject.lattice.spacing)
     return rewritten(dr.detach(subject.msdf), cut, near, template, subject.lattice)

@@ -10,7 +10,7 @@ from ...extraction.surface_mesh import SurfaceMesh
 from ...fields.smoothing import LatticeDiffusion, MeshDiffusion
 from ...lattice import Lattice
 from ...topology import equal_patches, mesh_components
-from ...triangles import face_areas
+from ...triangles import vertex_areas
 
 #: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
 _CERTAIN = 3.0
@@ -37,9 +37,7 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
     Returns:
         (V,) logits, those of flipped patches negated.
     """
-    area = np.zeros(len(vertices))
-    for corner in range(3):
-        np.add.at(area, faces[:, corner], face_areas(vertices, faces) / 3)
+    area = vertex_areas(vertices, faces)
     cleaned = logits.copy()
     piece = mesh_components(faces, len(vertices))
     piece_area = np.bincount(piece, area)[piece]
@@ -55,21 +53,21 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
     return cleaned
 
 
-def also_opened(values: np.ndarray, added: np.ndarray, smooth: MeshDiffusion,
-                scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Opens further vertices of a template, with smooth rims.
+def reopened(values: np.ndarray, opened: np.ndarray, smooth: MeshDiffusion,
+             scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Gives a template other openings, with smooth rims where they differ.
 
     Args:
         values: (V,) negative where the template is open.
-        added: (V,) the vertices to open.
+        opened: (V,) where it shall be.
         smooth: along the template.
         scale: of the new values; in [-scale, scale].
 
     Returns:
         (V,) values, and which of them are new.
     """
-    signs = smooth(mi.Float(np.where(added | (values <= 0), -1, 1).astype(np.float32))).numpy()
-    near = smooth(mi.Float(added.astype(np.float32))).numpy() > _NEAR
+    signs = smooth(mi.Float(np.where(opened, -1, 1).astype(np.float32))).numpy()
+    near = smooth(mi.Float((opened != (values <= 0)).astype(np.float32))).numpy() > _NEAR
     return np.where(near, scale * signs, values), near
 
 

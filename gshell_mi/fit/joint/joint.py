@@ -85,7 +85,7 @@ class JointStage:
         return self.geometry.optimizers | {"material": self.material_optimizer, "light": self.light_optimizer}
 
     def step(self, iteration: int) -> dict[str, float]:
-        """One step on one view; returns the losses.
+        """One step on ``step_views`` views; returns the losses.
 
         Raises:
             UserError: the steps before have left no surface.
@@ -95,18 +95,13 @@ class JointStage:
         moving = given or iteration >= config.warmup * config.iterations
         with phase("scene update"):
             self.apply(geometry=moving)
-        index = self._view(iteration)
-        seed = self.seed(iteration)
-        with phase("render") as compute:
-            image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[index],
-                              integrator=self.integrator, spp=config.primal_spp, spp_grad=config.spp,
-                              seed=seed, seed_grad=seed + 1)
-            compute(image)
-        target = self._targets[index]
+        views = self._views(iteration)
+        images = [self._render(view, self.seed(iteration, turn)) for turn, view in enumerate(views)]
         with phase("losses") as compute:
-            color = losses.IMAGE_LOSSES[config.image_loss](image[..., :3], target[..., :3])
-            mask = losses.mask_l2(image[..., 3], target[..., 3]) if self._sees_masks else mi.Float(0)
-            regularisation, terms = self._regularisers(index)
+            color = sum(self._image_loss(view, image) for view, image in zip(views, images, strict=True))
+            mask = sum(self._mask_loss(view, image) for view, image in zip(views, images, strict=True))
+            color, mask = color / len(views), mask / len(views)
+            regularisation, terms = self._regularisers(views)
             total = color + config.joint_mask * mask + regularisation
             compute(total)
         with phase("backward") as compute:
@@ -122,14 +117,16 @@ class JointStage:
             self._step_material(progress, diffuse)
             self._step_light(progress)
         self._follow_surface(rescan=(iteration + 1) % _RESCAN == 0)
-        error = mean(dr.square(dr.detach(image)[..., :3] - target[..., :3]))
-        return {"loss": total[0], "image": color[0], "mask": mask[0], "view": index,
+        error = sum(mean(dr.square(dr.detach(image)[..., :3] - self._targets[view][..., :3]))
+                    for view, image in zip(views, images, strict=True)) / len(views)
+        return {"loss": total[0], "image": color[0], "mask": mask[0],
                 **{name: value[0] for name, value in terms.items()},
                 "psnr": decibels(error[0])}
 
-    def seed(self, iteration: int) -> int:
-        """Of the samples of a step; the next number is that of its gradient's."""
-        return (self.config.seed * _SEEDS_APART + 2 * iteration) % 2**32
+    def seed(self, iteration: int, turn: int = 0) -> int:
+        """Of the samples of a step's view; the next number is that of its gradient's."""
+        turn += iteration * self.config.step_views
+        return (self.config.seed * _SEEDS_APART + 2 * turn) % 2**32
 
     def finish(self) -> None:
         """Leaves the last step's parameters in the scene, without what noise has cut out or left floating."""
@@ -155,11 +152,30 @@ class JointStage:
         vertices, faces, _ = surface.to_numpy()
         return Preview(vertices, faces, colors, template_vertices, template_faces)
 
-    def _view(self, iteration: int) -> int:
-        """Every view once per round, in an order that depends on seed and round alone."""
-        count = len(self.fit.sensors)
-        order = np.random.default_rng((self.config.seed, iteration // count)).permutation(count)
-        return int(order[iteration % count])
+    def _views(self, iteration: int) -> list[int]:
+        """Those of a step: every view once per round, in an order that depends on seed and round alone."""
+        count, views = len(self.fit.sensors), []
+        for turn in range(iteration * self.config.step_views, (iteration + 1) * self.config.step_views):
+            order = np.random.default_rng((self.config.seed, turn // count)).permutation(count)
+            views.append(int(order[turn % count]))
+        return views
+
+    def _render(self, view: int, seed: int) -> mi.TensorXf:
+        config = self.config
+        with phase("render") as compute:
+            image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[view],
+                              integrator=self.integrator, spp=config.primal_spp, spp_grad=config.spp,
+                              seed=seed, seed_grad=seed + 1)
+            compute(image)
+        return image
+
+    def _image_loss(self, view: int, image: mi.TensorXf) -> mi.Float:
+        return losses.IMAGE_LOSSES[self.config.image_loss](image[..., :3], self._targets[view][..., :3])
+
+    def _mask_loss(self, view: int, image: mi.TensorXf) -> mi.Float:
+        if not self._sees_masks:
+            return mi.Float(0)
+        return losses.mask_l2(image[..., 3], self._targets[view][..., 3])
 
     def apply(self, *, geometry: bool) -> None:
         """Puts what is optimised into the scene, with gradients enabled; the geometry only if asked."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import drjit as dr
@@ -47,36 +47,47 @@ class Regularisers:
         self._subject = fit.subject
         terms: dict[str, Callable[[], mi.Float]] = {
             "hole_opening": self._hole_opening,
-            "hole_closing": self._hole_closing,
-            "visible_outside": self._visible_outside,
-            "visible_inside": self._visible_inside,
+            "hole_closing": self._over_views(self._hole_closing),
+            "visible_outside": self._over_views(self._visible_outside),
+            "visible_inside": self._over_views(self._visible_inside),
             "sdf_sign": lambda: losses.sign_cross_entropy(self._in_cells("sdf"), self._subject.lattice),
             "eikonal": lambda: losses.eikonal(self._in_cells("sdf"), self._subject.lattice),
             "template_smoothness": self._template_smoothness,
         }
         if any(target.depth is not None for target in fit.targets):
-            terms["joint_depth"] = self._depth
+            terms["joint_depth"] = self._over_views(self._depth)
         if self._subject.lattice.weight_count:
             terms["flexicubes_deviation"] = self._flexicubes_deviation
         if material:
-            terms |= {"material_smoothness": self._material_smoothness, "albedo_chroma": self._albedo_chroma}
+            terms |= {"material_smoothness": self._material_smoothness,
+                      "albedo_chroma": self._over_views(self._albedo_chroma)}
         if light:
             terms |= {"light_smoothness": lambda: losses.light_smoothness(light.log_radiance),
                       "light_grey": self._light_grey}
         self._terms = {name: (getattr(config, name), term) for name, term in terms.items()
                        if getattr(config, name) > 0}
-        self._view = 0
+        self._view, self._step_views = 0, ()
 
-    def __call__(self, view: int) -> tuple[mi.Float, dict[str, mi.Float]]:
-        """The weighted sum, and every loss of its own, for a step on the view with this index."""
-        self._view = view
-        for lazy in ("_first_hits", "_template"):
-            self.__dict__.pop(lazy, None)
+    def __call__(self, views: Sequence[int]) -> tuple[mi.Float, dict[str, mi.Float]]:
+        """The weighted sum, and every loss of its own, for a step on the views with these indices."""
+        self._step_views = views
+        self.__dict__.pop("_template", None)
         total, values = mi.Float(0), {}
         for name, (weight, term) in self._terms.items():
             values[name] = term()
             total += weight * values[name]
         return total, values
+
+    def _over_views(self, term: Callable[[], mi.Float]) -> Callable[[], mi.Float]:
+        """The mean of a term over the views of the step."""
+        def averaged() -> mi.Float:
+            total = mi.Float(0)
+            for view in self._step_views:
+                self._view = view
+                self.__dict__.pop("_first_hits", None)
+                total += term()
+            return total / len(self._step_views)
+        return averaged
 
     # --- the mSDF
 

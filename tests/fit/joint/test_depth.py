@@ -124,9 +124,9 @@ def test_the_loss_is_the_difference_in_cells(scene):
     fit = load_fit_scene(scene)
     joint = stage(fit, RADIUS - 0.05)
     joint.apply(geometry=True)
-    _, terms = joint._regularisers(8)
+    _, terms = joint._regularisers([8])
     assert terms["joint_depth"][0] == pytest.approx(0.5, abs=0.05)
-    without = joint._regularisers(2)[1]["joint_depth"]
+    without = joint._regularisers([2])[1]["joint_depth"]
     assert without[0] == 0, "a view without a map"
     error = depth_error(fit, PinholeViews.from_sensors(fit.sensors), joint.scene)
     assert error == pytest.approx(0.05 * 2**0.5, abs=0.005)
@@ -138,7 +138,7 @@ def test_the_derivative_moves_the_surface_towards_the_map(scene):
 
     joint = stage(fit, RADIUS - 0.05)
     joint.apply(geometry=True)
-    dr.backward(joint._regularisers(8)[1]["joint_depth"])
+    dr.backward(joint._regularisers([8])[1]["joint_depth"])
     assert -dr.sum(dr.grad(joint.fields["sdf"]))[0] == pytest.approx(-10, rel=0.03)
 
 

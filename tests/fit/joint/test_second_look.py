@@ -13,9 +13,10 @@ from gshell_mi.fields import LatticeFields, sphere
 from gshell_mi.fields.smoothing import MeshDiffusion
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.ghost.pixels import PixelPool
-from gshell_mi.fit.joint import widening
+from gshell_mi.fit.joint import second_look
+from gshell_mi.fit.joint.growth import beside_openings, grown
+from gshell_mi.fit.joint.second_look import SecondLook, doubtful
 from gshell_mi.fit.joint.seen_through import Explained, explained
-from gshell_mi.fit.joint.widening import Widening, beside_openings, grown
 from gshell_mi.lattice import TetLattice
 from gshell_mi.targets import Target
 from gshell_mi.topology import topology
@@ -184,15 +185,15 @@ def evidence_above(monkeypatch):
         now = np.where(empty, 4.0 * (said["later"] if seed else 1.0), 1.0)
         return Explained(rays, rays * now, rays * np.where(empty, 6.0, 40.0))
 
-    monkeypatch.setattr(widening, "explained", fake)
+    monkeypatch.setattr(second_look, "explained", fake)
     return said
 
 
-CONFIG = FitConfig(iterations=8, widening=0.0, widening_gain=0.9)
+CONFIG = FitConfig(iterations=8, second_look=0.0, second_look_gain=0.9)
 
 
-def run(joint: StillJoint, steps: range, state: dict | None = None) -> Widening:
-    worker = Widening(joint, None, None, state or {})
+def run(joint: StillJoint, steps: range, state: dict | None = None) -> SecondLook:
+    worker = SecondLook(joint, None, None, state or {})
     for iteration in steps:
         worker.step(iteration)
     return worker
@@ -221,7 +222,7 @@ def test_growth_that_led_to_other_loops_is_taken_back(evidence_above):
     assert joint.height() == pytest.approx(0.45, abs=1.5 * LATTICE.spacing)
 
 
-@pytest.mark.parametrize("settings", [{"widening": 1.0}, {"watertight": True}, {"field": "hashgrid"},
+@pytest.mark.parametrize("settings", [{"second_look": 1.0}, {"watertight": True}, {"field": "hashgrid"},
                                       {"iterations": 1}])
 def test_modes_without_it(evidence_above, settings):
     joint = StillJoint(replace(CONFIG, **settings))

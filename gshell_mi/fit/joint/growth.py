@@ -1,0 +1,104 @@
+"""How openings grow along a template without any two of them meeting."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from ...fields.smoothing import MeshDiffusion
+from ...topology import equal_patches, mesh_edges, spread
+from .seen_through import Explained
+
+#: Rays, smoothed, that a vertex must have met.
+_RAYS = 3.0
+
+#: What is to be opened is explained worse than most of the surface by this factor ...
+_WORSE = 1.5
+
+#: ... and what is behind it, which nothing was fitted to yet, worse than it by at most this one. Behind what
+#: is really there it is dozens of times as bad.
+_BEHIND = 4.0
+
+#: Gaps of up to twice so many edges are grown over.
+_GAP = 1
+
+#: Vertices between openings that would meet, on either side of where they would.
+_WALL = 2
+
+#: Fewest vertices that an opening grows by in one place: less is the rim's own matter.
+_FEWEST = 12
+
+
+def beside_openings(values: np.ndarray, faces: np.ndarray, found: Explained,
+                    smooth: MeshDiffusion) -> np.ndarray:
+    """(V,) vertices beside openings without which the images would be explained about as well.
+
+    Args:
+        values: (V,) negative where the template is open.
+        faces: (F, 3) of the template.
+        found: how well the images are explained through each vertex.
+        smooth: along the template.
+    """
+    solid = values > 0
+    rays, now, without = (smooth(mi.Float(sums.astype(np.float32))).numpy()
+                          for sums in (found.rays, found.now, found.without))
+    met = solid & (rays > _RAYS)
+    if not met.any():
+        return met
+    typical = np.median(now[met] / rays[met])
+    empty = met & (now > _WORSE * typical * rays) & (without < _BEHIND * now)
+    edges, _ = mesh_edges(faces)
+    reached = ~solid | empty
+    for _ in range(_GAP):
+        reached = spread(reached, edges)
+    for _ in range(_GAP):
+        reached = ~spread(~reached, edges)
+    ratio = np.where(empty, without / np.maximum(now, 1e-30), _BEHIND)
+    blocked = reached & ~grown(~solid, reached, ratio, faces)
+    # A rim moves: what parts two rims has to be wide enough to outlast that.
+    for _ in range(_WALL):
+        blocked = spread(blocked, edges)
+    added = grown(~solid, reached & ~blocked, ratio, faces) & solid
+    patch = equal_patches(added, faces)
+    return added & (np.bincount(patch)[patch] >= _FEWEST)
+
+
+def grown(opened: np.ndarray, allowed: np.ndarray, order: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Openings grown as far as they may without parting a surface or an opening, or joining two of them.
+
+    A vertex may go if its neighbours, in a ring around it, are one run of open ones and one run of others
+    (a simple point of digital topology): all loops and handles of the surface stay then.
+
+    Args:
+        opened: (V,) the openings.
+        allowed: (V,) where they may grow.
+        order: (V,) vertices with lower values go first.
+        faces: (F, 3) of the watertight template.
+
+    Returns:
+        (V,) the openings afterwards.
+
+    >>> upper = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]]
+    >>> lower = [[5, 2, 1], [5, 3, 2], [5, 4, 3], [5, 1, 4]]
+    >>> number = np.arange(6)
+    >>> grown(number == 0, number < 4, number, np.array(upper + lower)).astype(int).tolist()
+    [1, 1, 1, 1, 0, 0]
+    """
+    opened = opened.copy()
+    edges, _ = mesh_edges(faces)
+    here, there = np.concatenate([edges, edges[:, ::-1]]).T
+    rank = np.empty(len(order), int)
+    rank[np.argsort(order, kind="stable")] = np.arange(len(order))
+    while True:
+        changes = np.zeros(len(opened), int)
+        for corner in range(3):
+            before, after = faces[:, (corner + 1) % 3], faces[:, (corner + 2) % 3]
+            differ = opened[before] != opened[after]
+            changes += np.bincount(faces[:, corner][differ], minlength=len(opened))
+        simple = allowed & ~opened & (changes == 2)
+        if not simple.any():
+            return opened
+        # Whether one may go depends on its neighbours, so of neighbours one goes at a time.
+        first = np.full(len(opened), len(opened))
+        np.minimum.at(first, here, np.where(simple, rank, len(opened))[there])
+        opened |= simple & (rank < first)

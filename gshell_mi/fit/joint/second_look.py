@@ -1,0 +1,246 @@
+"""Openings get a second look once light and material are known.
+
+The ghost finds openings before anything is known of the light. A cap that lies right behind a rim, such as at
+the end of a garment's pleat, it may leave: the radiance that it fits to a cap explains the few views that see
+in as well as the one that it fits to the dark inside. A path tracer knows how dark that is. So it is asked
+what would be seen without the surface beside an opening. Where that is about as good without anything having
+been fitted to it, the opening grows. And a small opening through which nothing looks like the images, such as
+one found in a bulge of the hull, is shut. After further steps each place is judged: it stays as it is
+now if the images are explained better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import drjit as dr
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...extraction.surface_mesh import SurfaceMesh
+from ...fields.smoothing import MeshDiffusion
+from ...topology import equal_patches, mesh_edges, spread, topology
+from ...triangles import positive_part, vertex_areas
+from ...views import PinholeViews
+from ..bookkeeping.observer import Preview
+from ..ghost.opening import clean_opacity, reopened, rewritten
+from ..ghost.pixels import PixelPool
+from .growth import beside_openings, grown
+from .joint import JointStage
+from .seen_through import Explained, explained
+
+#: Lambda that smooths errors along the template, and new rims.
+_SMOOTHING = 3.0
+
+#: An opening is doubtful if it is smaller than this fraction of the template ...
+_SMALL = 0.05
+
+#: ... and what is seen through it explained worse than the surface by this factor. Through true ones, such as
+#: sleeves, it is 5 to 8.
+_DOUBTFUL = 15.0
+
+#: Fewest rays by which an opening is doubted.
+_ENOUGH = 100
+
+#: Size, in cells, of the new mSDF.
+_SURE = 0.5
+
+#: Strips that part openings which have met are at most so many vertices wide on either side.
+_STRIP = 2
+
+#: Of the names in a checkpoint.
+_PREFIX = "second_look/"
+
+#: Vertices have the patch of what was nearest, up to this many cells away.
+_REACH = 1.5
+
+
+class SecondLook:
+    """A worker that reconsiders the openings of the joint stage between its steps.
+
+    Args:
+        joint: does the steps; its fields are explicit.
+        views, pixels: the targets.
+        state: what ``state`` gave, where the stage goes on.
+    """
+
+    def __init__(self, joint: JointStage, views: PinholeViews, pixels: PixelPool,
+                 state: Mapping[str, np.ndarray]):
+        self.joint, self._views, self._pixels = joint, views, pixels
+        config, count = joint.config, joint.config.iterations
+        #: The steps before which openings change and are judged.
+        self._changes = round(config.second_look * count)
+        self._judges = (self._changes + count + 1) // 2
+        if config.field != "explicit" or config.watertight or self._judges >= count:
+            self._changes = count     # never
+        self._state = {name: array for name, array in state.items() if name.startswith(_PREFIX)}
+
+    def step(self, iteration: int) -> Mapping[str, float]:
+        """One step of the joint stage, after what is to be done before it."""
+        if iteration == self._changes:
+            self._change(iteration)
+        elif iteration == self._judges and f"{_PREFIX}points" in self._state:
+            self._judge(iteration)
+        return self.joint.step(iteration)
+
+    def preview(self) -> Preview:
+        """The joint stage's."""
+        return self.joint.preview()
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What a checkpoint keeps, so that a fit that goes on judges alike."""
+        return dict(self._state)
+
+    def finish(self) -> bool | None:
+        """Ends the joint stage; returns whether openings have changed for good, None if none was doubted.
+
+        Growing must not change how many boundary loops there are. Where rims have met in the steps
+        afterwards, a strip of the surface comes back; if that does not help, all is undone.
+        """
+        self.joint.finish()
+        kept = self._state.get(f"{_PREFIX}kept")
+        if kept is None or not kept.any():
+            return None if kept is None else False
+        for width in range(_STRIP + 1):
+            if self._has_its_loops(kept):
+                return True
+            self._part(kept, width)
+            self.joint.finish()
+        if self._has_its_loops(kept):
+            return True
+        self._undo(kept)
+        self.joint.finish()
+        return False
+
+    def _change(self, iteration: int) -> None:
+        template, vertices, faces, values = self._template()
+        before = values <= 0
+        if before.all() or not before.any():
+            return
+        found = self._explained(template, iteration)
+        smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
+        shut = doubtful(values, vertices, faces, found)
+        grows = beside_openings(np.where(shut, self._scale, values), faces, found, smooth) & ~before
+        if not (grows | shut).any():
+            return
+        changed, near = reopened(values, (before | grows) & ~shut, smooth, self._scale)
+        self._write(template, changed, near)
+        patch = np.full(len(vertices), -1)
+        place = equal_patches(np.where(grows, 1, np.where(shut, 2, 0)), faces)
+        patch[grows | shut] = np.unique(place[grows | shut], return_inverse=True)[1]
+        # Shutting an opening takes its loops away; growing none.
+        solid = ~self._openings(vertices, faces, values)
+        loops = _loops(vertices, faces, solid)
+        spent = [loops - _loops(vertices, faces, solid | (shut & (patch == index)))
+                 for index in range(patch.max() + 1)]
+        self._state = {f"{_PREFIX}points": vertices, f"{_PREFIX}values": values, f"{_PREFIX}patch": patch,
+                       f"{_PREFIX}errors": _errors(found, patch, ~before),
+                       f"{_PREFIX}loops": np.array(loops), f"{_PREFIX}spent": np.array(spent)}
+
+    def _judge(self, iteration: int) -> None:
+        template, vertices, _, values = self._template()
+        patch, then = self._patches(vertices)[1], self._state[f"{_PREFIX}errors"]
+        now = _errors(self._explained(template, iteration), patch, values > 0, len(then) - 1)
+        # All of the surface has been explained better since.
+        ratio = now[:-1] / then[:-1] * (then[-1] / now[-1])
+        unjustified = ratio >= self.joint.config.second_look_gain
+        self._undo(unjustified)
+        self._state[f"{_PREFIX}kept"] = ~unjustified
+
+    def _undo(self, chosen: np.ndarray) -> None:
+        """Gives those patches that are chosen (P,) what they had before."""
+        if not chosen.any():
+            return
+        template, vertices, _, values = self._template()
+        nearest, patch = self._patches(vertices)
+        undone = (patch >= 0) & chosen[patch]
+        before = self._state[f"{_PREFIX}values"][nearest]
+        self._write(template, np.where(undone, before, values), undone)
+
+    def _has_its_loops(self, kept: np.ndarray) -> bool:
+        """Whether the surface has the loops from before but those of openings that were shut."""
+        vertices, faces, _ = self.joint.subject.surface.to_numpy()
+        expected = self._state[f"{_PREFIX}loops"] - self._state[f"{_PREFIX}spent"][kept].sum()
+        return topology(vertices, faces).boundary_loops == expected
+
+    def _part(self, kept: np.ndarray, width: int) -> None:
+        """Shuts strips, ``width`` vertices wide on either side, where openings have met."""
+        template, vertices, faces, values = self._template()
+        patch = self._patches(vertices)[1]
+        inside = (patch >= 0) & kept[patch]
+        opened = self._openings(vertices, faces, values)
+        others = self._openings(vertices, faces, np.where(opened & ~inside, values, self._scale))
+        strip = opened & ~grown(others, opened, values, faces)
+        edges, _ = mesh_edges(faces)
+        for _ in range(width):
+            strip = spread(strip, edges)
+        self._write(template, np.where(strip, self._scale, values), strip)
+
+    def _patches(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of vertices (V, 3) of the present template the nearest ones of that which was changed, and their
+        patches, -1 for none."""
+        distance, nearest = cKDTree(self._state[f"{_PREFIX}points"]).query(vertices)
+        near = distance < _REACH * self.joint.subject.cell_size
+        return nearest, np.where(near, self._state[f"{_PREFIX}patch"][nearest], -1)
+
+    def _openings(self, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """(V,) what is open, but for what is too small to be meant."""
+        return clean_opacity(values, vertices, faces, self.joint.config.ghost_min_area) <= 0
+
+    @property
+    def _scale(self) -> float:
+        """Of the new mSDF, in lattice units."""
+        return _SURE * self.joint.subject.lattice.spacing
+
+    def _template(self) -> tuple[SurfaceMesh, np.ndarray, np.ndarray, np.ndarray]:
+        """The present template, its vertices (V, 3) and faces (F, 3), and the mSDF (V,) at the former."""
+        self.joint.apply(geometry=True)
+        template = self.joint.subject.template()
+        vertices, faces, _ = template.to_numpy()
+        return template, vertices, faces, template.interpolate(dr.detach(self.joint.subject.msdf)).numpy()
+
+    def _explained(self, template: SurfaceMesh, iteration: int) -> Explained:
+        return explained(template, self.joint.scene, self.joint.integrator, self._views, self._pixels,
+                         self.joint.seed(iteration))
+
+    def _write(self, template: SurfaceMesh, values: np.ndarray, changed: np.ndarray) -> None:
+        """Gives the mSDF new values (V,) at those vertices of the template that have changed (V,)."""
+        subject = self.joint.subject
+        self.joint.geometry.replace("msdf", rewritten(dr.detach(subject.msdf), values, changed, template,
+                                                      subject.lattice))
+
+
+def doubtful(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found: Explained) -> np.ndarray:
+    """(V,) small openings through which the images are explained much worse than by the surface.
+
+    Args:
+        values: (V,) negative where the template is open.
+        vertices, faces: (V, 3) and (F, 3) of the template.
+        found: how well the images are explained through each vertex.
+    """
+    opened = values <= 0
+    surface = found.now[~opened].sum() / max(found.rays[~opened].sum(), 1.0)
+    patch = equal_patches(opened, faces)
+    area, rays, now = (np.bincount(patch, sums)[patch]
+                       for sums in (vertex_areas(vertices, faces), found.rays, found.now))
+    small = area < _SMALL * vertex_areas(vertices, faces).sum()
+    return opened & small & (rays > _ENOUGH) & (now > _DOUBTFUL * surface * rays)
+
+
+def _loops(vertices: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> int:
+    """Boundary loops of what is solid (V,) of a template."""
+    return topology(*positive_part(vertices, faces, np.where(solid, 1.0, -1.0))).boundary_loops
+
+
+def _errors(found: Explained, patch: np.ndarray, solid: np.ndarray, count: int | None = None) -> np.ndarray:
+    """(P + 1,) mean squared errors of the patches and of the remaining surface.
+
+    Args:
+        patch: (V,) patches from 0 to P - 1, or -1.
+        solid: (V,) surface.
+        count: P; default as many as there are in ``patch``.
+    """
+    count = patch.max(initial=-1) + 1 if count is None else count
+    label, counted = np.where(patch < 0, count, patch), (patch >= 0) | solid
+    rays, now = (np.bincount(label[counted], sums[counted], count + 1) for sums in (found.rays, found.now))
+    return np.maximum(now, 1e-6 * rays) / np.maximum(rays, 1.0)
