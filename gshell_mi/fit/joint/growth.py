@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 
 from ...fields.smoothing import MeshDiffusion
 from ...topology import equal_patches, mesh_edges, spread
@@ -29,15 +31,17 @@ _WALL = 2
 _FEWEST = 12
 
 
-def beside_openings(values: np.ndarray, faces: np.ndarray, found: Explained,
-                    smooth: MeshDiffusion) -> np.ndarray:
-    """(V,) vertices beside openings without which the images would be explained about as well.
+def near_openings(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found: Explained,
+                  smooth: MeshDiffusion, reach: float) -> np.ndarray:
+    """(V,) vertices near openings without which the images would be explained about as well.
 
     Args:
         values: (V,) negative where the template is open.
-        faces: (F, 3) of the template.
+        vertices, faces: (V, 3) and (F, 3) of the watertight template.
         found: how well the images are explained through each vertex.
         smooth: along the template.
+        reach: the longest way along the template between an opening and what opens apart from it, in the
+            unit of the vertices.
     """
     solid = values > 0
     rays, now, without = (smooth(mi.Float(sums.astype(np.float32))).numpy()
@@ -54,13 +58,67 @@ def beside_openings(values: np.ndarray, faces: np.ndarray, found: Explained,
     for _ in range(_GAP):
         reached = ~spread(~reached, edges)
     ratio = np.where(empty, without / np.maximum(now, 1e-30), _BEHIND)
-    blocked = reached & ~grown(~solid, reached, ratio, faces)
+    opened = ~solid
+    apart = reached & ~spread(grown(opened, reached, ratio, faces), edges)
+    opened[_seeds(apart, ratio, _distances(opened, vertices, faces, reach)[0], faces)] = True
+    blocked = reached & ~grown(opened, reached, ratio, faces)
     # A rim moves: what parts two rims has to be wide enough to outlast that.
     for _ in range(_WALL):
         blocked = spread(blocked, edges)
-    added = grown(~solid, reached & ~blocked, ratio, faces) & solid
+    added = grown(opened, reached & ~blocked, ratio, faces) & solid
     patch = equal_patches(added, faces)
     return added & (np.bincount(patch)[patch] >= _FEWEST)
+
+
+def joined(openings: np.ndarray, apart: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
+           reach: float) -> np.ndarray:
+    """Openings with those that lie apart, and with the shortest ways along the template between them.
+
+    At the neck of a pleat the two sides of the cloth may touch, and what is inside it then ends twice: there,
+    and at its other end. Both ends are one opening in truth, and so is the way between them.
+
+    Args:
+        openings: (V,) what is joined to.
+        apart: (V,) what is to be joined. Of less than a dozen connected vertices nothing is.
+        vertices, faces: (V, 3) and (F, 3) of the watertight template.
+        reach: the longest way, in the unit of the vertices.
+    """
+    openings = openings.copy()
+    patch = equal_patches(apart, faces)
+    large = apart & (np.bincount(patch)[patch] >= _FEWEST)
+    while (large & ~openings).any():
+        distance, before = _distances(openings, vertices, faces, reach)
+        distance[~large | openings] = np.inf
+        here = int(np.argmin(distance))
+        if not np.isfinite(distance[here]):
+            break
+        openings |= patch == patch[here]
+        while before[here] >= 0:
+            here = before[here]
+            openings[here] = True
+    return openings
+
+
+def _distances(openings: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
+               reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """(V,) lengths of the shortest ways to an opening, infinite beyond ``reach``, and (V,) the next vertex on
+    each, negative for none."""
+    start, end = mesh_edges(faces)[0].T
+    length = np.linalg.norm(vertices[start] - vertices[end], axis=1)
+    graph = coo_matrix((length, (start, end)), (len(vertices), len(vertices))).tocsr()
+    distance, before, _ = dijkstra(graph, directed=False, indices=np.flatnonzero(openings), limit=reach,
+                                   min_only=True, return_predecessors=True)
+    return distance, before
+
+
+def _seeds(apart: np.ndarray, order: np.ndarray, distance: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Of each large connected patch of ``apart`` (V,) that is within reach, the vertex that comes first."""
+    patch = equal_patches(apart, faces)
+    nearest = np.full(len(apart), np.inf)
+    np.minimum.at(nearest, patch, distance)
+    candidates = np.flatnonzero(apart & (np.bincount(patch)[patch] >= _FEWEST) & np.isfinite(nearest[patch]))
+    candidates = candidates[np.argsort(order[candidates], kind="stable")]
+    return candidates[np.unique(patch[candidates], return_index=True)[1]]
 
 
 def grown(opened: np.ndarray, allowed: np.ndarray, order: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
 from ..ghost.opening import clean_opacity, reopened, rewritten
 from ..ghost.pixels import PixelPool
-from .growth import beside_openings, grown
+from .growth import grown, joined, near_openings
 from .joint import JointStage
 from .seen_through import Explained, explained
 
@@ -44,6 +44,9 @@ _ENOUGH = 100
 
 #: Size, in cells, of the new mSDF.
 _SURE = 0.5
+
+#: Longest way, in cells, between an opening and what opens apart from it.
+_WAY = 14.0
 
 #: Strips that part openings which have met are at most so many vertices wide on either side.
 _STRIP = 2
@@ -97,10 +100,12 @@ class SecondLook:
         Growing must not change how many boundary loops there are. Where rims have met in the steps
         afterwards, a strip of the surface comes back; if that does not help, all is undone.
         """
-        self.joint.finish()
         kept = self._state.get(f"{_PREFIX}kept")
         if kept is None or not kept.any():
+            self.joint.finish()
             return None if kept is None else False
+        self._join(kept)
+        self.joint.finish()
         for width in range(_STRIP + 1):
             if self._has_its_loops(kept):
                 return True
@@ -120,7 +125,8 @@ class SecondLook:
         found = self._explained(template, iteration)
         smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
         shut = doubtful(values, vertices, faces, found)
-        grows = beside_openings(np.where(shut, self._scale, values), faces, found, smooth) & ~before
+        grows = near_openings(np.where(shut, self._scale, values), vertices, faces, found, smooth,
+                              self._reach) & ~before
         if not (grows | shut).any():
             return
         changed, near = reopened(values, (before | grows) & ~shut, smooth, self._scale)
@@ -146,6 +152,7 @@ class SecondLook:
         unjustified = ratio >= self.joint.config.second_look_gain
         self._undo(unjustified)
         self._state[f"{_PREFIX}kept"] = ~unjustified
+        self._join(~unjustified)
 
     def _undo(self, chosen: np.ndarray) -> None:
         """Gives those patches that are chosen (P,) what they had before."""
@@ -162,6 +169,18 @@ class SecondLook:
         vertices, faces, _ = self.joint.subject.surface.to_numpy()
         expected = self._state[f"{_PREFIX}loops"] - self._state[f"{_PREFIX}spent"][kept].sum()
         return topology(vertices, faces).boundary_loops == expected
+
+    def _join(self, kept: np.ndarray) -> None:
+        """Opens a narrow way to what has opened in the patches that were kept and lies apart."""
+        template, vertices, faces, values = self._template()
+        patch = self._patches(vertices)[1]
+        inside = (patch >= 0) & kept[patch]
+        opened = values <= 0
+        others = self._openings(vertices, faces, np.where(opened & ~inside, values, self._scale))
+        place = equal_patches(opened, faces)
+        apart = opened & ~np.isin(place, place[others])
+        ways = joined(others, apart & inside, vertices, faces, self._reach) & ~opened
+        self._write(template, np.where(ways, -self._scale, values), ways)
 
     def _part(self, kept: np.ndarray, width: int) -> None:
         """Shuts strips, ``width`` vertices wide on either side, where openings have met."""
@@ -186,6 +205,11 @@ class SecondLook:
     def _openings(self, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
         """(V,) what is open, but for what is too small to be meant."""
         return clean_opacity(values, vertices, faces, self.joint.config.ghost_min_area) <= 0
+
+    @property
+    def _reach(self) -> float:
+        """Longest way to what opens apart, in world units."""
+        return _WAY * self.joint.subject.cell_size
 
     @property
     def _scale(self) -> float:

@@ -16,8 +16,8 @@ from gshell_mi.scene import load_fit_scene
 #: Losses over the surface, whose size changes, that the defaults leave out.
 LOSSES = {"hole_opening": 1e-3, "hole_closing": 1e-3, "sdf_sign": 1e-3, "eikonal": 1e-3,
           "template_smoothness": 1e-3}
-CONFIG = FitConfig(iterations=100, warmup=0, geometry_lr=0.3, spp=2, primal_spp=2, light_height=8,
-                   band_resolution=99)
+CONFIG = FitConfig(iterations=100, step_views=2, warmup=0, geometry_lr=0.6, spp=2, primal_spp=2,
+                   light_height=8, band_resolution=99)
 
 
 @pytest.mark.parametrize(("grid", "settings"),

@@ -14,7 +14,7 @@ from gshell_mi.fields.smoothing import MeshDiffusion
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.ghost.pixels import PixelPool
 from gshell_mi.fit.joint import second_look
-from gshell_mi.fit.joint.growth import beside_openings, grown
+from gshell_mi.fit.joint.growth import grown, joined, near_openings
 from gshell_mi.fit.joint.second_look import SecondLook, doubtful
 from gshell_mi.fit.joint.seen_through import Explained, explained
 from gshell_mi.lattice import TetLattice
@@ -59,6 +59,20 @@ def test_what_an_opening_surrounds_is_not_cut_off(ball):
     assert result.sum() > 0.9 * allowed.sum()
 
 
+# --- joining
+
+
+def test_what_lies_apart_is_joined_by_a_narrow_way(ball):
+    """Between two caps of a tenth of the sphere, at right angles, it is 90 - 2 * 36.9 degrees or 0.28."""
+    up, side = cap(ball, [0, 0, 1], 0.1), cap(ball, [1, 0, 0], 0.1)
+    result = joined(up, side, ball.vertices, ball.faces, 1.0)
+    ways = result & ~up & ~side
+    assert loops(ball, up | side) == (2, 1) and loops(ball, result) == (1, 1)
+    assert 0 < ways.sum() <= 0.4 / ball.edges_unique_length.mean()
+    assert (joined(up, side, ball.vertices, ball.faces, 0.2) == up).all(), "farther than it may be"
+    assert (joined(up, side & (np.cumsum(side) < 6), ball.vertices, ball.faces, 1.0) == up).all(), "too small"
+
+
 # --- where
 
 
@@ -68,14 +82,18 @@ def evidence(ball, empty: np.ndarray) -> Explained:
     return Explained(np.full(len(empty), 50.0), 50 * now, 50 * np.where(empty, 6.0, 40.0))
 
 
-def test_openings_grow_into_what_is_empty_beside_them(ball):
-    """But what is as empty elsewhere stays: how many openings there are, others have decided."""
+@pytest.mark.parametrize(("reach", "apart"), [(0.5, False), (3.0, True)])
+def test_openings_grow_into_what_is_empty_near_them(ball, reach, apart):
+    """What is as empty opposite, 1.7 away, opens only if that is near enough."""
     up, wide, down = (cap(ball, [0, 0, z], share) for z, share in ((1, 0.05), (1, 0.15), (-1, 0.1)))
     values, smooth = np.where(up, -1.0, 1.0), MeshDiffusion(ball.faces, len(up), 0.5)
-    added = beside_openings(values, ball.faces, evidence(ball, wide | down), smooth)
-    assert not (added & (up | down)).any()
+    found = evidence(ball, wide | down)
+    added = near_openings(values, ball.vertices, ball.faces, found, smooth, reach)
+    assert not (added & up).any()
     np.testing.assert_array_equal(added[~up & cap(ball, [0, 0, 1], 0.13)], True)
-    assert not added[~cap(ball, [0, 0, 1], 0.18)].any()
+    np.testing.assert_array_equal(added[cap(ball, [0, 0, -1], 0.08)], apart)
+    assert not added[~cap(ball, [0, 0, 1], 0.18) & ~cap(ball, [0, 0, -1], 0.13)].any()
+    assert loops(ball, up | added) == (1 + apart, 1)
 
 
 @pytest.mark.parametrize("change", ["explained as well as the rest", "much worse without", "not met"])
@@ -87,7 +105,18 @@ def test_what_is_not_clearly_empty_stays(ball, change):
              "not met": Explained(*(np.where(wide, 0.01, 1) * sums
                                     for sums in (found.rays, found.now, found.without)))}[change]
     smooth = MeshDiffusion(ball.faces, len(up), 0.5)
-    assert not beside_openings(np.where(up, -1.0, 1.0), ball.faces, found, smooth).any()
+    assert not near_openings(np.where(up, -1.0, 1.0), ball.vertices, ball.faces, found, smooth, 3.0).any()
+
+
+@pytest.mark.parametrize(("share", "error", "rays", "doubted"), [
+    (0.03, 20.0, 50.0, True), (0.1, 20.0, 50.0, False), (0.03, 10.0, 50.0, False), (0.03, 20.0, 0.1, False)],
+    ids=["small", "large", "explained not much worse", "hardly seen"])
+def test_small_openings_that_show_what_no_image_does_are_doubtful(ball, share, error, rays, doubted):
+    up, down = cap(ball, [0, 0, 1], share), cap(ball, [0, 0, -1], 0.03)
+    seen = np.where(up, rays, 50.0)
+    found = Explained(seen, seen * np.where(up, error, np.where(down, 6.0, 1.0)), seen)
+    result = doubtful(np.where(up | down, -1.0, 1.0), ball.vertices, ball.faces, found)
+    np.testing.assert_array_equal(result, up & doubted)
 
 
 # --- the evidence
@@ -162,6 +191,10 @@ class StillJoint:
     def seed(self, iteration):
         return iteration
 
+    def cut(self, opened: np.ndarray) -> None:
+        """Opens the lattice's vertices, too, that are true."""
+        self._replace("msdf", mi.Float(np.where(opened, -0.05, self.subject.msdf.numpy()).astype(np.float32)))
+
     def height(self) -> float:
         """Of the surface's highest point, which is on its rim."""
         self.apply(geometry=True)
@@ -175,14 +208,15 @@ class StillJoint:
 
 @pytest.fixture
 def evidence_above(monkeypatch):
-    """Says that there is nothing above z = 0.2; in what follows the images are explained by ``later``."""
-    said = {"later": 1.0}
+    """Says that there is nothing above z = 0.2, or that the side x > 0.5 is explained badly; errors of both
+    change by the factor ``later``."""
+    said = {"later": 1.0, "empty": 4.0, "doubtful": 1.0}
 
     def fake(template, scene, integrator, views, pixels, seed):
-        z = template.to_numpy()[0][:, 2]
-        empty = z > 0.2
-        rays = np.full(len(z), 50.0)
-        now = np.where(empty, 4.0 * (said["later"] if seed else 1.0), 1.0)
+        x, _, z = template.to_numpy()[0].T
+        empty, side = z > 0.2, x > 0.5
+        rays, later = np.full(len(z), 50.0), said["later"] if seed else 1.0
+        now = np.where(empty, said["empty"] * later, np.where(side, said["doubtful"] * later, 1.0))
         return Explained(rays, rays * now, rays * np.where(empty, 6.0, 40.0))
 
     monkeypatch.setattr(second_look, "explained", fake)
@@ -220,6 +254,38 @@ def test_growth_that_led_to_other_loops_is_taken_back(evidence_above):
     joint.geometry.replace("msdf", mi.Float(np.minimum(joint.subject.msdf.numpy(), below).astype(np.float32)))
     assert worker.finish() is False
     assert joint.height() == pytest.approx(0.45, abs=1.5 * LATTICE.spacing)
+
+
+def test_openings_that_have_met_are_parted(evidence_above):
+    """Of two openings one grows, and later a strip between them goes, and more."""
+    evidence_above["later"] = 0.5
+    joint, (x, _, z) = StillJoint(CONFIG), LATTICE.vertex_positions().T
+    joint.cut(0.8 * x - 0.6 * z > 0.45)
+    worker = run(joint, range(7))
+    assert joint.loops() == 2
+    joint.cut((x > 0.1) & (z > -0.25))
+    joint.apply(geometry=True)
+    assert joint.loops() == 1
+    assert worker.finish() is True
+    assert joint.loops() == 2
+    above, all_above = (((z > 0.25) & (z < 0.45)).sum() for z in (
+        mesh.to_numpy()[0][:, 2] for mesh in (joint.subject.surface, joint.subject.template())))
+    assert above < 0.9 * all_above, "not all that had opened comes back"
+
+
+@pytest.mark.parametrize("later", [0.5, 1.1])
+def test_a_doubtful_opening_stays_shut_if_the_images_are_explained_better(evidence_above, later):
+    """The opening at the side is small, and nothing looks like the images through it."""
+    evidence_above |= {"later": later, "doubtful": 200.0, "empty": 1.0}
+    joint = StillJoint(CONFIG)
+    joint.cut(LATTICE.vertex_positions()[:, 0] > 0.55)
+    joint.apply(geometry=True)
+    assert joint.loops() == 2
+    worker = run(joint, range(1))
+    assert joint.loops() == 1, "shut at first, either way"
+    worker = run(joint, range(1, 8), worker.state())
+    assert worker.finish() is (later < 1)
+    assert joint.loops() == (1 if later < 1 else 2)
 
 
 @pytest.mark.parametrize("settings", [{"second_look": 1.0}, {"watertight": True}, {"field": "hashgrid"},
