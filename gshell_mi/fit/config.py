@@ -23,8 +23,8 @@ _CALMER = 0.3
 
 #: What ``--preview`` has instead: less of everything, but for the steps that openings need.
 _PREVIEW = {"resolution": 48, "ghost_iterations": 600, "ghost_batch": 16384, "carving_iterations": 0,
-            "refinement_iterations": 0, "iterations": 70, "primal_spp": 4, "max_depth": 2,
-            "color_hold": 0, "even_start": False, "light_height": 16, "second_look": 1,
+            "refinement_iterations": 0, "iterations": 70, "step_views": 1, "primal_spp": 4,
+            "max_depth": 2, "color_hold": 0, "even_start": False, "light_height": 16, "second_look": 1,
             "triptychs": 4}
 
 
