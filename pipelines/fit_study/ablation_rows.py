@@ -65,6 +65,8 @@ ROWS = [
             ("fine-only", "smoothing 0.5 throughout", {"geometry_smoothing": 0.5}),
             ("coarse-only", "smoothing 8 throughout", {"geometry_detail": 8.0}),
             ("no-offsets", "no vertex offsets", {"deform_lr": 0.0}),
+            ("no-second-look", "no second look at openings", {"second_look": 1.0}),
+            ("one-view", "one view per step", {"step_views": 1}),
             ("no-warmup", "no warm-up", {"warmup": 0.0}),
             ("shadow-derivatives", "visibility of shadows differentiated", {"reparam_depth": 2}),
             ("short-paths", "images lack what is not differentiated", {"max_depth": 3}),

@@ -137,7 +137,7 @@ class SecondLook:
         # Shutting an opening takes its loops away; growing none.
         solid = ~self._openings(vertices, faces, values)
         loops = _loops(vertices, faces, solid)
-        spent = [loops - _loops(vertices, faces, solid | (shut & (patch == index)))
+        spent = [np.subtract(loops, _loops(vertices, faces, solid | (shut & (patch == index))))
                  for index in range(patch.max() + 1)]
         self._state = {f"{_PREFIX}points": vertices, f"{_PREFIX}values": values, f"{_PREFIX}patch": patch,
                        f"{_PREFIX}errors": _errors(found, patch, ~before),
@@ -165,10 +165,11 @@ class SecondLook:
         self._write(template, np.where(undone, before, values), undone)
 
     def _has_its_loops(self, kept: np.ndarray) -> bool:
-        """Whether the surface has the loops from before but those of openings that were shut."""
-        vertices, faces, _ = self.joint.subject.surface.to_numpy()
-        expected = self._state[f"{_PREFIX}loops"] - self._state[f"{_PREFIX}spent"][kept].sum()
-        return topology(vertices, faces).boundary_loops == expected
+        """Whether the surface has the loops from before but those of openings that were shut, and no more
+        pin-holes."""
+        found = topology(*self.joint.subject.surface.to_numpy()[:2])
+        loops, pinholes = self._state[f"{_PREFIX}loops"] - self._state[f"{_PREFIX}spent"][kept].sum(axis=0)
+        return found.boundary_loops == loops and found.pinholes <= max(pinholes, 0)
 
     def _join(self, kept: np.ndarray) -> None:
         """Opens a narrow way to what has opened in the patches that were kept and lies apart."""
@@ -251,9 +252,10 @@ def doubtful(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found:
     return opened & small & (rays > _ENOUGH) & (now > _DOUBTFUL * surface * rays)
 
 
-def _loops(vertices: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> int:
-    """Boundary loops of what is solid (V,) of a template."""
-    return topology(*positive_part(vertices, faces, np.where(solid, 1.0, -1.0))).boundary_loops
+def _loops(vertices: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> tuple[int, int]:
+    """Boundary loops and pin-holes of what is solid (V,) of a template."""
+    found = topology(*positive_part(vertices, faces, np.where(solid, 1.0, -1.0)))
+    return found.boundary_loops, found.pinholes
 
 
 def _errors(found: Explained, patch: np.ndarray, solid: np.ndarray, count: int | None = None) -> np.ndarray:
