@@ -55,7 +55,7 @@ _STRIP = 2
 _PREFIX = "second_look/"
 
 #: Vertices have the patch of what was nearest, up to this many cells away.
-_REACH = 1.5
+_NEAR = 1.5
 
 
 class SecondLook:
@@ -159,9 +159,8 @@ class SecondLook:
         if not chosen.any():
             return
         template, vertices, _, values = self._template()
-        nearest, patch = self._patches(vertices)
-        undone = (patch >= 0) & chosen[patch]
-        before = self._state[f"{_PREFIX}values"][nearest]
+        undone = self._inside(vertices, chosen)
+        before = self._state[f"{_PREFIX}values"][self._patches(vertices)[0]]
         self._write(template, np.where(undone, before, values), undone)
 
     def _has_its_loops(self, kept: np.ndarray) -> bool:
@@ -174,9 +173,7 @@ class SecondLook:
     def _join(self, kept: np.ndarray) -> None:
         """Opens a narrow way to what has opened in the patches that were kept and lies apart."""
         template, vertices, faces, values = self._template()
-        patch = self._patches(vertices)[1]
-        inside = (patch >= 0) & kept[patch]
-        opened = values <= 0
+        inside, opened = self._inside(vertices, kept), values <= 0
         others = self._openings(vertices, faces, np.where(opened & ~inside, values, self._scale))
         place = equal_patches(opened, faces)
         apart = opened & ~np.isin(place, place[others])
@@ -186,9 +183,7 @@ class SecondLook:
     def _part(self, kept: np.ndarray, width: int) -> None:
         """Shuts strips, ``width`` vertices wide on either side, where openings have met."""
         template, vertices, faces, values = self._template()
-        patch = self._patches(vertices)[1]
-        inside = (patch >= 0) & kept[patch]
-        opened = self._openings(vertices, faces, values)
+        inside, opened = self._inside(vertices, kept), self._openings(vertices, faces, values)
         others = self._openings(vertices, faces, np.where(opened & ~inside, values, self._scale))
         strip = opened & ~grown(others, opened, values, faces)
         edges, _ = mesh_edges(faces)
@@ -196,11 +191,16 @@ class SecondLook:
             strip = spread(strip, edges)
         self._write(template, np.where(strip, self._scale, values), strip)
 
+    def _inside(self, vertices: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """Which vertices (V, 3) of the present template are in those patches that are chosen (P,)."""
+        patch = self._patches(vertices)[1]
+        return (patch >= 0) & chosen[patch]
+
     def _patches(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of vertices (V, 3) of the present template the nearest ones of that which was changed, and their
         patches, -1 for none."""
         distance, nearest = cKDTree(self._state[f"{_PREFIX}points"]).query(vertices)
-        near = distance < _REACH * self.joint.subject.cell_size
+        near = distance < _NEAR * self.joint.subject.cell_size
         return nearest, np.where(near, self._state[f"{_PREFIX}patch"][nearest], -1)
 
     def _openings(self, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
