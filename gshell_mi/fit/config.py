@@ -192,7 +192,7 @@ class FitConfig:
     """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
     material_gradient_smoothing: float = 1.0
     """Lambda of the material's Sobolev gradient on the lattice; spreads colour to what few pixels see."""
-    material_lr: float = 0.3
+    material_lr: float = 0.2
     """Adam's step for base colour, roughness and metallic (logits)."""
     color_hold: float = 0.5
     """Fraction of the stage in which the base colour's steps grow from 0 to --material-lr if the light is
