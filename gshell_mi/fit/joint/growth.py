@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from ...fields.smoothing import MeshDiffusion
@@ -60,7 +60,7 @@ def near_openings(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, f
     ratio = np.where(empty, without / np.maximum(now, 1e-30), _BEHIND)
     opened = ~solid
     apart = reached & ~spread(grown(opened, reached, ratio, faces), edges)
-    opened[_seeds(apart, ratio, _distances(opened, vertices, faces, reach)[0], faces)] = True
+    opened[_seeds(apart, ratio, _distances(_ways(vertices, faces), opened, reach)[0], faces)] = True
     blocked = reached & ~grown(opened, reached, ratio, faces)
     # A rim moves: what parts two rims has to be wide enough to outlast that.
     for _ in range(_WALL):
@@ -83,11 +83,11 @@ def joined(openings: np.ndarray, apart: np.ndarray, vertices: np.ndarray, faces:
         vertices, faces: (V, 3) and (F, 3) of the watertight template.
         reach: the longest way, in the unit of the vertices.
     """
-    openings = openings.copy()
+    openings, ways = openings.copy(), _ways(vertices, faces)
     patch = equal_patches(apart, faces)
     large = apart & (np.bincount(patch)[patch] >= _FEWEST)
     while (large & ~openings).any():
-        distance, before = _distances(openings, vertices, faces, reach)
+        distance, before = _distances(ways, openings, reach)
         distance[~large | openings] = np.inf
         here = int(np.argmin(distance))
         if not np.isfinite(distance[here]):
@@ -99,14 +99,17 @@ def joined(openings: np.ndarray, apart: np.ndarray, vertices: np.ndarray, faces:
     return openings
 
 
-def _distances(openings: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
-               reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """(V,) lengths of the shortest ways to an opening, infinite beyond ``reach``, and (V,) the next vertex on
-    each, negative for none."""
+def _ways(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
+    """(V, V) lengths of a mesh's edges."""
     start, end = mesh_edges(faces)[0].T
     length = np.linalg.norm(vertices[start] - vertices[end], axis=1)
-    graph = coo_matrix((length, (start, end)), (len(vertices), len(vertices))).tocsr()
-    distance, before, _ = dijkstra(graph, directed=False, indices=np.flatnonzero(openings), limit=reach,
+    return coo_matrix((length, (start, end)), (len(vertices), len(vertices))).tocsr()
+
+
+def _distances(ways: csr_matrix, openings: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """(V,) lengths of the shortest ways to an opening, infinite beyond ``reach``, and (V,) the next vertex on
+    each, negative for none."""
+    distance, before, _ = dijkstra(ways, directed=False, indices=np.flatnonzero(openings), limit=reach,
                                    min_only=True, return_predecessors=True)
     return distance, before
 

@@ -159,8 +159,9 @@ class SecondLook:
         if not chosen.any():
             return
         template, vertices, _, values = self._template()
-        undone = self._inside(vertices, chosen)
-        before = self._state[f"{_PREFIX}values"][self._patches(vertices)[0]]
+        nearest, patch = self._patches(vertices)
+        undone = (patch >= 0) & chosen[patch]
+        before = self._state[f"{_PREFIX}values"][nearest]
         self._write(template, np.where(undone, before, values), undone)
 
     def _has_its_loops(self, kept: np.ndarray) -> bool:
@@ -245,10 +246,9 @@ def doubtful(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found:
     """
     opened = values <= 0
     surface = found.now[~opened].sum() / max(found.rays[~opened].sum(), 1.0)
-    patch = equal_patches(opened, faces)
-    area, rays, now = (np.bincount(patch, sums)[patch]
-                       for sums in (vertex_areas(vertices, faces), found.rays, found.now))
-    small = area < _SMALL * vertex_areas(vertices, faces).sum()
+    patch, areas = equal_patches(opened, faces), vertex_areas(vertices, faces)
+    area, rays, now = (np.bincount(patch, sums)[patch] for sums in (areas, found.rays, found.now))
+    small = area < _SMALL * areas.sum()
     return opened & small & (rays > _ENOUGH) & (now > _DOUBTFUL * surface * rays)
 
 
