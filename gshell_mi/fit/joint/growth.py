@@ -11,8 +11,9 @@ from ...fields.smoothing import MeshDiffusion
 from ...topology import equal_patches, mesh_edges, spread
 from .seen_through import Explained
 
-#: Rays, smoothed, that a vertex must have met.
-_RAYS = 3.0
+#: Least share of the rays, smoothed, that a vertex meets of those which half of the surface meets. What few
+#: views see into may as well be a fold whose shape is not known.
+_SEEN = 0.5
 
 #: What is to be opened is explained worse than most of the surface by this factor ...
 _WORSE = 1.5
@@ -46,9 +47,10 @@ def near_openings(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, f
     solid = values > 0
     rays, now, without = (smooth(mi.Float(sums.astype(np.float32))).numpy()
                           for sums in (found.rays, found.now, found.without))
-    met = solid & (rays > _RAYS)
+    met = solid & (rays > 0)
     if not met.any():
         return met
+    met &= rays > _SEEN * np.median(rays[met])
     typical = np.median(now[met] / rays[met])
     empty = met & (now > _WORSE * typical * rays) & (without < _BEHIND * now)
     edges, _ = mesh_edges(faces)
@@ -57,6 +59,9 @@ def near_openings(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, f
         reached = spread(reached, edges)
     for _ in range(_GAP):
         reached = ~spread(~reached, edges)
+    # Around an island an opening would meet itself; what is smaller than a place that grows does not stay.
+    patch = equal_patches(reached, faces)
+    reached |= np.bincount(patch)[patch] < _FEWEST
     ratio = np.where(empty, without / np.maximum(now, 1e-30), _BEHIND)
     opened = ~solid
     apart = reached & ~spread(grown(opened, reached, ratio, faces), edges)

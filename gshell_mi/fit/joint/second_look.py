@@ -119,6 +119,8 @@ class SecondLook:
 
     def _change(self, iteration: int) -> None:
         template, vertices, faces, values = self._template()
+        # Specks would grow into openings of their own, apart from the one that they belong to.
+        values = self._cleaned(vertices, faces, values)
         before = values <= 0
         if before.all() or not before.any():
             return
@@ -135,7 +137,7 @@ class SecondLook:
         place = equal_patches(np.where(grows, 1, np.where(shut, 2, 0)), faces)
         patch[grows | shut] = np.unique(place[grows | shut], return_inverse=True)[1]
         # Shutting an opening takes its loops away; growing none.
-        solid = ~self._openings(vertices, faces, values)
+        solid = ~before
         loops = _loops(vertices, faces, solid)
         spent = [np.subtract(loops, _loops(vertices, faces, solid | (shut & (patch == index))))
                  for index in range(patch.max() + 1)]
@@ -206,7 +208,11 @@ class SecondLook:
 
     def _openings(self, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
         """(V,) what is open, but for what is too small to be meant."""
-        return clean_opacity(values, vertices, faces, self.joint.config.ghost_min_area) <= 0
+        return self._cleaned(vertices, faces, values) <= 0
+
+    def _cleaned(self, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """The mSDF (V,) without the openings and the islands that are too small to be meant."""
+        return clean_opacity(values, vertices, faces, self.joint.config.ghost_min_area)
 
     @property
     def _reach(self) -> float:
