@@ -39,6 +39,10 @@ _SMALL = 0.05
 #: sleeves, it is 5 to 8.
 _DOUBTFUL = 15.0
 
+#: It is doubtful, too, if the error is that of covered pixels that show nothing at all: a loose part of the
+#: object has been cut away.
+_NOTHING = 3.0
+
 #: Fewest rays by which an opening is doubted.
 _ENOUGH = 100
 
@@ -255,7 +259,7 @@ def doubtful(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found:
     patch, areas = equal_patches(opened, faces), vertex_areas(vertices, faces)
     area, rays, now = (np.bincount(patch, sums)[patch] for sums in (areas, found.rays, found.now))
     small = area < _SMALL * areas.sum()
-    return opened & small & (rays > _ENOUGH) & (now > _DOUBTFUL * surface * rays)
+    return opened & small & (rays > _ENOUGH) & (now > min(_DOUBTFUL * surface, _NOTHING) * rays)
 
 
 def _loops(vertices: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> tuple[int, int]:

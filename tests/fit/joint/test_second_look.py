@@ -121,14 +121,22 @@ def test_what_is_not_clearly_empty_stays(ball, change):
 
 
 @pytest.mark.parametrize(("share", "error", "rays", "doubted"), [
-    (0.03, 20.0, 50.0, True), (0.1, 20.0, 50.0, False), (0.03, 10.0, 50.0, False), (0.03, 20.0, 0.1, False)],
+    (0.03, 2.0, 50.0, True), (0.1, 2.0, 50.0, False), (0.03, 1.0, 50.0, False), (0.03, 2.0, 0.1, False)],
     ids=["small", "large", "explained not much worse", "hardly seen"])
 def test_small_openings_that_show_what_no_image_does_are_doubtful(ball, share, error, rays, doubted):
     up, down = cap(ball, [0, 0, 1], share), cap(ball, [0, 0, -1], 0.03)
     seen = np.where(up, rays, 50.0)
-    found = Explained(seen, seen * np.where(up, error, np.where(down, 6.0, 1.0)), seen)
+    found = Explained(seen, seen * np.where(up, error, np.where(down, 0.6, 0.1)), seen)
     result = doubtful(np.where(up | down, -1.0, 1.0), ball.vertices, ball.faces, found)
     np.testing.assert_array_equal(result, up & doubted)
+
+
+def test_openings_through_which_nothing_is_seen_are_doubtful(ball):
+    """Where pixels are covered: however badly the surface is explained, there is nothing that could be."""
+    up, down = cap(ball, [0, 0, 1], 0.03), cap(ball, [0, 0, -1], 0.03)
+    rays = np.full(len(up), 50.0)
+    found = Explained(rays, rays * np.where(up, 4.0, np.where(down, 2.0, 0.5)), rays)
+    np.testing.assert_array_equal(doubtful(np.where(up | down, -1.0, 1.0), ball.vertices, ball.faces, found), up)
 
 
 # --- the evidence
@@ -222,14 +230,14 @@ class StillJoint:
 def evidence_above(monkeypatch):
     """Says that there is nothing above z = 0.2, or that the side x > 0.5 is explained badly; errors of both
     change by the factor ``later``."""
-    said = {"later": 1.0, "empty": 4.0, "doubtful": 1.0}
+    said = {"later": 1.0, "empty": 0.4, "doubtful": 0.1}
 
     def fake(template, scene, integrator, views, pixels, seed):
         x, _, z = template.to_numpy()[0].T
         empty, side = z > 0.2, x > 0.5
         rays, later = np.full(len(z), 50.0), said["later"] if seed else 1.0
-        now = np.where(empty, said["empty"] * later, np.where(side, said["doubtful"] * later, 1.0))
-        return Explained(rays, rays * now, rays * np.where(empty, 6.0, 40.0))
+        now = np.where(empty, said["empty"] * later, np.where(side, said["doubtful"] * later, 0.1))
+        return Explained(rays, rays * now, rays * np.where(empty, 0.6, 4.0))
 
     monkeypatch.setattr(second_look, "explained", fake)
     return said
@@ -299,7 +307,7 @@ def test_openings_that_have_met_are_parted(evidence_above):
 @pytest.mark.parametrize("later", [0.5, 1.1])
 def test_a_doubtful_opening_stays_shut_if_the_images_are_explained_better(evidence_above, later):
     """The opening at the side is small, and nothing looks like the images through it."""
-    evidence_above |= {"later": later, "doubtful": 200.0, "empty": 1.0}
+    evidence_above |= {"later": later, "doubtful": 20.0, "empty": 0.1}
     joint = StillJoint(CONFIG)
     joint.cut(LATTICE.vertex_positions()[:, 0] > 0.55)
     joint.apply(geometry=True)
