@@ -136,7 +136,8 @@ def test_openings_through_which_nothing_is_seen_are_doubtful(ball):
     up, down = cap(ball, [0, 0, 1], 0.03), cap(ball, [0, 0, -1], 0.03)
     rays = np.full(len(up), 50.0)
     found = Explained(rays, rays * np.where(up, 4.0, np.where(down, 2.0, 0.5)), rays)
-    np.testing.assert_array_equal(doubtful(np.where(up | down, -1.0, 1.0), ball.vertices, ball.faces, found), up)
+    result = doubtful(np.where(up | down, -1.0, 1.0), ball.vertices, ball.faces, found)
+    np.testing.assert_array_equal(result, up)
 
 
 # --- the evidence
