@@ -152,7 +152,7 @@ class SecondLook:
     def _judge(self, iteration: int) -> None:
         template, vertices, _, values = self._template()
         patch, then = self._patches(vertices)[1], self._state[f"{_PREFIX}errors"]
-        now = _errors(self._explained(template, iteration), patch, values > 0, len(then) - 1)
+        now = _errors(self._explained(template, iteration, behind=False), patch, values > 0, len(then) - 1)
         # All of the surface has been explained better since.
         ratio = now[:-1] / then[:-1] * (then[-1] / now[-1])
         unjustified = ratio >= self.joint.config.second_look_gain
@@ -235,9 +235,9 @@ class SecondLook:
         vertices, faces, _ = template.to_numpy()
         return template, vertices, faces, template.interpolate(dr.detach(self.joint.subject.msdf)).numpy()
 
-    def _explained(self, template: SurfaceMesh, iteration: int) -> Explained:
+    def _explained(self, template: SurfaceMesh, iteration: int, *, behind: bool = True) -> Explained:
         return explained(template, self.joint.scene, self.joint.integrator, self._views, self._pixels,
-                         self.joint.seed(iteration))
+                         self.joint.seed(iteration), behind=behind)
 
     def _write(self, template: SurfaceMesh, values: np.ndarray, changed: np.ndarray) -> None:
         """Gives the mSDF new values (V,) at those vertices of the template that have changed (V,)."""

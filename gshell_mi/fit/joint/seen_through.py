@@ -43,7 +43,8 @@ class Explained:
         rays: (V,) how many.
         now: (V,) squared errors of the scene as it is. Their expectation is free of the noise of path
             tracing, so sums over few rays may be negative.
-        without: (V,) squared errors of what would be seen if nothing were where the rays meet the template.
+        without: (V,) squared errors of what would be seen if nothing were where the rays meet the template;
+            0 if that was not asked for.
     """
 
     rays: np.ndarray
@@ -52,7 +53,7 @@ class Explained:
 
 
 def explained(template: SurfaceMesh, scene: mi.Scene, integrator, views: PinholeViews, pixels: PixelPool,
-              seed: int) -> Explained:
+              seed: int, *, behind: bool = True) -> Explained:
     """Compares a scene, with and without its template, with the targets' wholly covered pixels.
 
     Args:
@@ -61,6 +62,7 @@ def explained(template: SurfaceMesh, scene: mi.Scene, integrator, views: Pinhole
         integrator: a ``gshell_path`` that hides emitters.
         views, pixels: the targets.
         seed: of the pixels and the paths.
+        behind: whether to ask for what would be seen without the template, which is half of the work.
     """
     with dr.suspend_grad():
         vertices, faces, _ = template.to_numpy()
@@ -79,14 +81,17 @@ def explained(template: SurfaceMesh, scene: mi.Scene, integrator, views: Pinhole
             origin, direction, distance, prim, uv, target = (
                 dr.gather(type(value), value, index)
                 for value in (ray.o, ray.d, hit.t, hit.prim_index, hit.prim_uv, sample.radiance))
-            through = mi.Ray3f(origin + direction * (distance + offset), direction)
+            rays = [mi.Ray3f(origin, direction)]
+            if behind:
+                rays.append(mi.Ray3f(origin + direction * (distance + offset), direction))
             sampler = mi.load_dict({"type": "independent"})
             sampler.seed(dr.opaque(mi.UInt32, (seed * _BATCHES + batch) % 2**32), dr.width(index))
             errors = [_squared_error(scene, integrator, sampler, seen, target, mean_radiance, coverage)
-                      for seen in (mi.Ray3f(origin, direction), through)]
+                      for seen in rays]
             face = dr.gather(mi.Vector3u, corners, prim)
             weights = 1 - uv.x - uv.y, uv.x, uv.y
-            for total, values in zip(sums, (mi.Float(1), *errors), strict=True):
+            # Without what is behind there are two sums.
+            for total, values in zip(sums, (mi.Float(1), *errors), strict=False):
                 for weight, vertex in zip(weights, face, strict=True):
                     dr.scatter_reduce(dr.ReduceOp.Add, total, weight * values, vertex)
             dr.eval(sums)

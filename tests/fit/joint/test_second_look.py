@@ -175,6 +175,9 @@ def test_what_is_left_of_a_lid_is_explained_by_what_is_behind_it():
     show(half_ball(0.22))
     views, template = PinholeViews.from_sensors(sensors), subject.template()
     found = explained(template, scene, integrator, views, PixelPool(views, targets), seed=1)
+    once = explained(template, scene, integrator, views, PixelPool(views, targets), seed=1, behind=False)
+    np.testing.assert_array_equal(once.without, 0)
+    assert once.now.sum() == pytest.approx(found.now.sum(), rel=0.02)
     x, y, z = template.to_numpy()[0].T
     lid = (y > -0.05) & (np.hypot(x, z) > 0.4) & (np.hypot(x, z) < 0.5)
     now, without = (np.array([sums[part].sum() / found.rays[part].sum() for part in (lid, y < -0.2)])
@@ -233,7 +236,7 @@ def evidence_above(monkeypatch):
     change by the factor ``later``."""
     said = {"later": 1.0, "empty": 0.4, "doubtful": 0.1}
 
-    def fake(template, scene, integrator, views, pixels, seed):
+    def fake(template, scene, integrator, views, pixels, seed, behind):
         x, _, z = template.to_numpy()[0].T
         empty, side = z > 0.2, x > 0.5
         rays, later = np.full(len(z), 50.0), said["later"] if seed else 1.0
