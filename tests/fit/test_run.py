@@ -188,27 +188,28 @@ def test_interrupted_by_the_user(bowl_scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_and_resumed(bowl_scene, whole, tmp_path):
+def test_killed_and_resumed(bowl_scene, tmp_path):
     """Killed once in each stage, the fit takes the steps that it would have taken."""
-    killed = tmp_path / "killed"
+    # Which vertices a second look opens is a choice, and rounding alone leads to another one.
+    whole, killed, options = tmp_path / "whole", tmp_path / "killed", ("--second-look", "1")
+    assert fit(bowl_scene, whole, *options) == 0
     for stage, iteration, resume in (("ghost", 30, ()), ("carving", 5, ("--resume",)),
                                      ("refinement", 3, ("--resume",)), ("joint", 1, ("--resume",))):
-        process = start(bowl_scene, killed, "--checkpoint-seconds", "0.05", *resume)
+        process = start(bowl_scene, killed, "--checkpoint-seconds", "0.05", *options, *resume)
         wait_for_step(process, killed, stage, iteration)
         process.kill()
         process.communicate()
         assert process.returncode == -signal.SIGKILL
         assert not (killed / "mesh.ply").exists()
-    assert fit(bowl_scene, killed, "--resume") == 0
+    assert fit(bowl_scene, killed, "--resume", *options) == 0
     assert steps(killed) == steps(whole), "no step is missing and none is logged twice"
 
     # Sums over threads depend on their order, and rounding that turns the sign of a residual turns its L1
     # gradient. Where vertices move, differences grow tenfold with every step. Two whole runs agree to 1e-5
-    # before; to 2 % in the refinement; in the joint stage to 1e-4 at first and to 2 % until openings change
-    # after half of the steps. Which vertices go is a choice, and they agree to a quarter from there on.
+    # before; to 2 % in the refinement; in the joint stage to 1e-4 at first, a few per cent at the end.
     expected, found = (np.array([step["loss"] for step in log(output)]) for output in (whole, killed))
-    tolerance = {"ghost": 1e-3, "carving": 1e-3, "refinement": 0.06, "joint": 0.5}
-    allowed = [tolerance[stage] if stage != "joint" or iteration >= 6 else 1e-3 if iteration <= 2 else 0.06
+    tolerance = {"ghost": 1e-3, "carving": 1e-3, "refinement": 0.06, "joint": 0.2}
+    allowed = [1e-3 if stage == "joint" and iteration <= 2 else tolerance[stage]
                for stage, iteration in steps(whole)]
     np.testing.assert_array_less(np.abs(found / expected - 1), allowed)
 

@@ -273,8 +273,8 @@ def test_growth_stays_if_the_images_are_explained_better(evidence_above, later, 
 def test_specks_grow_with_the_opening_that_they_belong_to(evidence_above):
     """Noise has cut a few vertices out of what is to open: one opening comes of it, as of the rest."""
     evidence_above["later"] = 0.5
-    joint, (x, _, z) = StillJoint(CONFIG), LATTICE.vertex_positions().T
-    joint.cut((x > 0.45) & (np.abs(z - 0.35) < 0.06) & (np.abs(LATTICE.vertex_positions()[:, 1]) < 0.06))
+    joint, (x, y, z) = StillJoint(CONFIG), LATTICE.vertex_positions().T
+    joint.cut((x > 0.45) & (np.abs(z - 0.35) < 0.06) & (np.abs(y) < 0.06))
     joint.apply(geometry=True)
     assert joint.loops() == 2
     run(joint, range(1))
