@@ -93,7 +93,8 @@ def test_paths_that_are_not_differentiated_are_in_the_image_alone():
         for depths in ({"max_depth": 3}, {"max_depth": 5}, {"max_depth": 5, "gradient_depth": 3}))
     of_short, of_long, of_both = (np.array(mi.render(mover.scene, integrator=integrator, spp=8, seed=3))
                                   for integrator in (short, long, both))
-    np.testing.assert_array_equal(of_both, of_long)
+    # To rounding: a film adds its samples up in the order in which threads get there.
+    np.testing.assert_allclose(of_both, of_long, rtol=1e-5, atol=1e-7)
     assert of_long[..., :3].sum() > 1.02 * of_short[..., :3].sum()
     assert (weighted([scenes.forward_image(mover, both, 8, 3)])[0]
             == pytest.approx(weighted([scenes.forward_image(mover, short, 8, 3)])[0], rel=1e-4))
