@@ -6,6 +6,11 @@ import drjit as dr
 import mitsuba as mi
 
 
+def finite(value: mi.Float) -> mi.Float:
+    """The values, 0 in place of those that are NaN or infinite."""
+    return dr.select(dr.isfinite(value), value, 0)
+
+
 def trusted(gradient: mi.Float, most: float = 30.0) -> mi.Float:
     """Derivatives of which none is larger than ``most`` times the mean size of those that are not 0.
 
@@ -19,7 +24,7 @@ def trusted(gradient: mi.Float, most: float = 30.0) -> mi.Float:
     >>> print(dr.min(trusted(gradient)) > -200, trusted(gradient)[8], trusted(gradient)[0])
     [True] 0.0 1.0
     """
-    gradient = dr.select(dr.isfinite(gradient), gradient, 0)
+    gradient = finite(gradient)
     for _ in range(2):  # what is far out shifts the mean, too: the second one is without it
         size = dr.abs(gradient)
         largest = most * dr.sum(size) / dr.maximum(dr.count(size > 0), 1)

@@ -15,6 +15,7 @@ from ..files import replacing
 from ..images import over_white, psnr, triptych, write_png
 from ..topology import topology
 from .ply import write_ply
+from .slivers import without_slivers
 from .stock_scene import MAX_DEPTH, write_light, write_scene
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dic
 def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.ndarray]) -> None:
     vertices, faces, _ = surface.to_numpy()
     normals = np.array(surface.vertex_normals().numpy()).T.reshape(-1, 3)
-    write_ply(path, vertices, faces, normals, attributes)
+    write_ply(path, without_slivers(vertices, faces), faces, normals, attributes)
 
 
 def _write_views(output: Path, fit: FitScene, count: int) -> dict[str, float]:

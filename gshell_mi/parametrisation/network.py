@@ -13,7 +13,7 @@ from drjit import nn
 from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import BlockLattice, Lattice
-from ..outliers import trusted
+from ..outliers import finite, trusted
 from ..schedules import decay_at
 from .explicit import ExplicitGrid
 from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched
@@ -221,8 +221,7 @@ class NetworkFields(Parametrisation):
     def _adam_step(self, rate: float) -> None:
         self.optimizer.set_learning_rate({key: rate for key in self.optimizer.keys()})
         for key in self.optimizer.keys():
-            gradient = dr.grad(self.optimizer[key])
-            dr.set_grad(self.optimizer[key], dr.select(dr.isfinite(gradient), gradient, 0))
+            dr.set_grad(self.optimizer[key], finite(dr.grad(self.optimizer[key])))
         self.optimizer.step()
 
     def _batch(self, iteration: int) -> mi.UInt32:

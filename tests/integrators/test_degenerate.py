@@ -81,6 +81,24 @@ def test_finite(name, kind):
     assert np.isfinite(image).all() and np.isfinite(grad).all()
 
 
+def test_a_sample_that_is_no_number_is_left_out():
+    """A sliver's attributes may interpolate to NaN."""
+    def image(color):
+        v, f = scenes.sphere(2)
+        colors = np.full((len(v), 3), 0.5, np.float32)
+        colors[np.argmax(v[:, 2])] = color
+        mesh = scenes.make_mesh("subject", v, f, {"type": "diffuse", "reflectance": {
+            "type": "mesh_attribute", "name": "vertex_color"}})
+        mesh.add_attribute("vertex_color", 3, colors.ravel())
+        scene = scenes.load(scenes.camera(16), scenes.constant(), mesh)
+        return np.array(mi.render(scene, integrator=make_integrator(), spp=4))
+
+    broken, whole = image(np.nan), image(0.5)
+    assert np.isfinite(broken).all()
+    changed = np.any(broken != whole, axis=-1)
+    assert changed[8, 8] and 0 < changed.mean() < 0.25
+
+
 def test_behind_the_camera_has_no_gradient_of_coverage():
     v, f = scenes.sphere(1, 1, (0, 0, 9))
     scene = scenes.load(scenes.camera(16), scenes.constant(), scenes.make_mesh("subject", v, f))

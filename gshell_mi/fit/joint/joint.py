@@ -13,6 +13,7 @@ from ...images import decibels
 from ...light import EnvironmentLight
 from ...material import GivenMaterial, MaterialField, principled
 from ...means import mean
+from ...outliers import finite
 from ...parametrisation import StepRules, make_parametrisation
 from ...scene import FitScene
 from ...schedules import decay_at
@@ -209,6 +210,9 @@ class JointStage:
         config, optimizer = self.config, self.material_optimizer
         if not optimizer.state:
             return
+        # One derivative that is no number would spread over all others, and stay in the optimiser for good.
+        for name in optimizer.keys():
+            dr.set_grad(optimizer[name], finite(dr.grad(optimizer[name])))
         gradients = {name: dr.grad(optimizer[name]) for name in self.material.on_lattice}
         for name, gradient in diffuse.together(gradients, config.material_gradient_smoothing).items():
             dr.set_grad(optimizer[name], gradient)
@@ -222,7 +226,7 @@ class JointStage:
         optimizer = self.light_optimizer
         if not optimizer.state:
             return
-        gradient = dr.grad(optimizer["log_radiance"])
+        gradient = finite(dr.grad(optimizer["log_radiance"]))
         dr.set_grad(optimizer["log_radiance"], gradient / self.light.solid_angles)
         optimizer.set_learning_rate(decay_at(progress) * self.config.light_lr)
         optimizer.step()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from bowl import RADIUS, sensors_xml
 
+from gshell_mi import losses
 from gshell_mi.fields import sphere
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.joint.joint import JointStage
@@ -55,9 +56,7 @@ def fit(tmp_path_factory):
     for sensor in truth.sensors():
         mi.util.write_bitmap(str(folder / "ball" / f"{sensor.id()}.exr"),
                              mi.render(truth, sensor=sensor, integrator=path, spp=256), write_async=False)
-    loaded = load_fit_scene(folder / "ball.xml")
-    loaded.subject.set_fields(sphere(LATTICE, RADIUS))
-    return loaded
+    return load_fit_scene(folder / "ball.xml")
 
 
 @pytest.fixture
@@ -70,6 +69,7 @@ def seen() -> dict[str, np.ndarray]:
 
 
 def start(fit, seen, config: FitConfig) -> JointStage:
+    fit.subject.set_fields(sphere(LATTICE, RADIUS))
     return JointStage(fit, start_material(fit, seen, LATTICE, config), start_light(fit, seen, config), config)
 
 
@@ -98,6 +98,25 @@ def test_the_light_moves_first(fit, seen):
     assert color[0] == 0 and light[0] == pytest.approx(CONFIG.light_lr, rel=1e-3)
     assert color[7] > 5 * color[1]
     assert roughness[0] == pytest.approx(CONFIG.material_lr, rel=1e-3)
+
+
+def test_a_derivative_that_is_no_number_stays_alone(fit, seen, monkeypatch):
+    """One pixel's, as of a sliver; the optimisers would never be rid of it."""
+    def spoiled(image, target):
+        return losses.log_l1(image, target) + dr.nan * image[8, 8, 0]
+
+    joint = start(fit, seen, replace(CONFIG, warmup=0.0, color_hold=0.0))
+    joint.step(0)
+    monkeypatch.setitem(losses.IMAGE_LOSSES, "log_l1", spoiled)
+    joint.step(1)
+    monkeypatch.undo()
+    before = joint.light_optimizer["log_radiance"].numpy()
+    joint.step(2)
+    joint.finish()
+    for optimizer in joint.optimizers.values():
+        assert all(np.isfinite(optimizer[name].numpy()).all() for name in optimizer.keys())
+    assert not joint.subject.surface.is_empty
+    assert np.abs(joint.light_optimizer["log_radiance"].numpy() - before).max() > 0
 
 
 def test_a_material_under_a_given_light_need_not_wait(fit, seen):
