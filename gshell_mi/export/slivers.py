@@ -36,8 +36,8 @@ def without_slivers(vertices: np.ndarray, faces: np.ndarray, narrowest: float = 
     moved = np.array(vertices, np.float64)
     for _ in range(_ROUNDS):
         area = area_vectors(moved, faces)
-        # Edge i lies opposite corner i.
-        edges = np.stack([moved[faces[:, (i + 2) % 3]] - moved[faces[:, (i + 1) % 3]] for i in range(3)], axis=1)
+        corners = moved[faces]
+        edges = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)   # edge i lies opposite corner i
         lengths = np.linalg.norm(edges, axis=2)
         corner = lengths.argmax(axis=1)
         length = lengths.max(axis=1)

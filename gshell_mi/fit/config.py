@@ -179,17 +179,17 @@ class FitConfig:
     """Such a change stays if, after half of the remaining steps, the squared image error there is below this
     multiple of what it was, times what the rest of the surface has gained meanwhile. Above 1, as colours were
     fitted to a cap for longer than anything was to what is behind it."""
-    geometry_lr: float = 0.14
+    geometry_lr: float = 0.25
     """Largest change of sdf per step, in cells; of the mSDF too if --field is not explicit."""
     msdf_lr: float = 0.4
     """Largest change of the mSDF per step, in cells; falls a hundredfold. Its steps are halfway between one
     size per vertex and one for all, so that a rim moves where it hardly shows, too."""
     deform_lr: float = 0.035
     """Largest change of the vertex offsets per step; 1 is the greatest offset allowed."""
-    geometry_smoothing: float = 8.0
+    geometry_smoothing: float = 100.0
     """Lambda of the Sobolev gradient (I + lambda L)^-1 on the lattice when the geometry starts to move: whole
     parts move first, details last."""
-    geometry_detail: float = 0.5
+    geometry_detail: float = 1.0
     """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
     material_gradient_smoothing: float = 1.0
     """Lambda of the material's Sobolev gradient on the lattice; spreads colour to what few pixels see."""
@@ -253,7 +253,10 @@ class FitConfig:
 
     def for_detail(self) -> FitConfig:
         """The settings of the joint stage as those of the detail stage, which begins where that has ended."""
+        # The lattice is twice as fine: the same smoothing is four times as many square cells. The surface is
+        # nearly where it belongs.
         return replace(self, iterations=self.detail_iterations, warmup=0, color_hold=0, second_look=1,
+                       geometry_lr=0.5 * self.geometry_lr, geometry_smoothing=4 * self.geometry_detail,
                        material_lr=_CALMER * self.material_lr, light_lr=_CALMER * self.light_lr)
 
     @property

@@ -138,7 +138,7 @@ class GShellPathIntegrator(ADIntegrator):
             active = active_next
 
         covered = scattered | (not self.hide_emitters and scene.environment() is not None)
-        # A sliver's attributes may interpolate to no number; one such sample would reach all pixels around it.
+        # A sliver's attributes may interpolate to no number; that would reach all pixels around the sample.
         L = dr.select(dr.all(dr.isfinite(L)), L, 0)
         return PathSample(L, dr.select(covered, mi.Float(1), mi.Float(0)), [])
 

@@ -37,22 +37,22 @@ def test_what_is_wide_enough_stays():
     np.testing.assert_array_equal(without_slivers(fan(0.01), FACES), fan(0.01))
 
 
-def interpolated(vertices: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """What stock Mitsuba makes of the attribute x in the first triangle, above ``along``."""
+def interpolated(vertices: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """What stock Mitsuba makes of the attribute x in the first triangle."""
     mesh = mi.Mesh("fan", len(vertices), 1)
     mesh.add_attribute("vertex_value", 1, vertices[:, 0].astype(np.float32))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
     parameters["faces"] = mi.UInt32(FACES[0].astype(np.uint32))
     parameters.update()
-    si = dr.zeros(mi.SurfaceInteraction3f, len(along))
-    si.p = mi.Point3f(mi.Float(along.astype(np.float32)), mi.Float((0.3 * vertices[4, 1] * along).astype(np.float32)), 0)
-    si.shape, si.prim_index = mi.ShapePtr(mesh), dr.zeros(mi.UInt32, len(along))
+    si = dr.zeros(mi.SurfaceInteraction3f, len(x))
+    si.p = mi.Point3f(np.stack([x, 0.3 * vertices[4, 1] * x, 0 * x]).astype(np.float32))
+    si.shape, si.prim_index = mi.ShapePtr(mesh), dr.zeros(mi.UInt32, len(x))
     return mesh.eval_attribute_1("vertex_value", si).numpy()
 
 
 def test_stock_mitsuba_interpolates_over_what_is_written():
-    along = np.linspace(0.1, 0.9, 100)
-    off = [np.abs(interpolated(vertices, along) - along).max()
+    x = np.linspace(0.1, 0.9, 100)
+    off = [np.abs(interpolated(vertices, x) - x).max()
            for vertices in (fan(1e-5), without_slivers(fan(1e-5), FACES))]
     assert not off[0] < 0.1 and off[1] < 0.03

@@ -61,9 +61,11 @@ def test_its_rates_are_those_of_what_has_settled():
     before = FitConfig(iterations=260, detail_iterations=7)
     after = before.for_detail()
     assert (after.iterations, after.warmup, after.color_hold, after.second_look) == (7, 0, 0, 1)
+    assert after.geometry_lr < before.geometry_lr and after.geometry_smoothing < before.geometry_smoothing
     assert after.material_lr < before.material_lr and after.light_lr < before.light_lr
     assert replace(after, iterations=260, warmup=before.warmup, color_hold=before.color_hold,
-                   second_look=before.second_look, material_lr=before.material_lr,
+                   second_look=before.second_look, geometry_lr=before.geometry_lr,
+                   geometry_smoothing=before.geometry_smoothing, material_lr=before.material_lr,
                    light_lr=before.light_lr) == before
 
 
