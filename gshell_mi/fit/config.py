@@ -188,7 +188,7 @@ class FitConfig:
     """Largest change of the vertex offsets per step; 1 is the greatest offset allowed."""
     geometry_smoothing: float = 100.0
     """Lambda of the Sobolev gradient (I + lambda L)^-1 on the lattice when the geometry starts to move: whole
-    parts move first, details last."""
+    parts move first, details last. Few iterations solve for it, so all above 16 spread over two cells."""
     geometry_detail: float = 1.0
     """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
     material_gradient_smoothing: float = 1.0
