@@ -6,7 +6,7 @@ in as well as the one that it fits to the dark inside. A path tracer knows how d
 what would be seen without the surface beside an opening. Where that is about as good without anything having
 been fitted to it, the opening grows. And a small opening through which nothing looks like the images, such as
 one found in a bulge of the hull, is shut. After further steps each place is judged: it stays as it is
-now if the images are explained better.
+now if the images are explained better. A loose part that has come back so, and is a sheet, opens on one side.
 """
 
 from __future__ import annotations
@@ -14,15 +14,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ...extraction.surface_mesh import SurfaceMesh
 from ...fields.smoothing import MeshDiffusion
-from ...topology import equal_patches, mesh_edges, spread, topology
+from ...topology import equal_patches, mesh_components, mesh_edges, spread, topology
 from ...triangles import positive_part, vertex_areas
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
+from ..cut.small_sheets import small_sheets
 from ..ghost.opening import clean_opacity, reopened, rewritten
 from ..ghost.pixels import PixelPool
 from .growth import grown, joined, near_openings
@@ -57,6 +59,9 @@ _STRIP = 2
 
 #: Of the names in a checkpoint.
 _PREFIX = "second_look/"
+
+#: Mean thickness, in cells, up to which a loose part is a sheet; lattices hold none thinner than one.
+_SHEET = 1.5
 
 #: Vertices have the patch of what was nearest, up to this many cells away.
 _NEAR = 1.5
@@ -102,7 +107,8 @@ class SecondLook:
         """Ends the joint stage; returns whether openings have changed for good, None if none was doubted.
 
         Growing must not change how many boundary loops there are. Where rims have met in the steps
-        afterwards, a strip of the surface comes back; if that does not help, all is undone.
+        afterwards, a strip of the surface comes back. If that does not help, but undoing all does, all is
+        undone.
         """
         kept = self._state.get(f"{_PREFIX}kept")
         if kept is None or not kept.any():
@@ -117,9 +123,15 @@ class SecondLook:
             self.joint.finish()
         if self._has_its_loops(kept):
             return True
+        self.joint.apply(geometry=True)
+        msdf = mi.Float(dr.detach(self.joint.subject.msdf))
         self._undo(kept)
         self.joint.finish()
-        return False
+        if self._has_its_loops(np.zeros_like(kept)):
+            return False
+        self.joint.geometry.replace("msdf", msdf)
+        self.joint.finish()
+        return True
 
     def _change(self, iteration: int) -> None:
         template, vertices, faces, values = self._template()
@@ -140,7 +152,7 @@ class SecondLook:
         patch = np.full(len(vertices), -1)
         place = equal_patches(np.where(grows, 1, np.where(shut, 2, 0)), faces)
         patch[grows | shut] = np.unique(place[grows | shut], return_inverse=True)[1]
-        # Shutting an opening takes its loops away; growing none.
+        # Shutting an opening takes its loops away, growing none; a sheet that comes back brings one.
         solid = ~before
         loops = _loops(vertices, faces, solid)
         spent = [np.subtract(loops, _loops(vertices, faces, solid | (shut & (patch == index))))
@@ -158,7 +170,25 @@ class SecondLook:
         unjustified = ratio >= self.joint.config.second_look_gain
         self._undo(unjustified)
         self._state[f"{_PREFIX}kept"] = ~unjustified
+        self._open_sheets(~unjustified)
         self._join(~unjustified)
+
+    def _open_sheets(self, kept: np.ndarray) -> None:
+        """Opens one side of the sheets among the loose parts that have come back in kept patches (P,)."""
+        template, vertices, faces, values = self._template()
+        nearest, patch = self._patches(vertices)
+        back = (patch >= 0) & kept[patch] & (self._state[f"{_PREFIX}values"][nearest] <= 0)
+        part = mesh_components(faces, len(vertices))
+        elsewhere = 2 * np.bincount(part, back) < np.bincount(part)
+        others = elsewhere[part] | self._openings(vertices, faces, values)
+        side, _ = small_sheets(vertices, template.vertex_normals().numpy().T, faces, others,
+                               _SHEET * self.joint.subject.cell_size)
+        self._write(template, np.where(side, -self._scale, values), side)
+        for sheet in np.unique(part[side]):
+            owner = np.bincount(patch[back & (part == sheet)]).argmax()
+            self._state[f"{_PREFIX}spent"][owner] -= (1, 0)
+        # From here on these are openings like those from before.
+        self._state[f"{_PREFIX}patch"][nearest[side]] = -1
 
     def _undo(self, chosen: np.ndarray) -> None:
         """Gives those patches that are chosen (P,) what they had before."""
