@@ -74,7 +74,7 @@ def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dic
 def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.ndarray]) -> None:
     vertices, faces, _ = surface.to_numpy()
     normals = np.array(surface.vertex_normals().numpy()).T.reshape(-1, 3)
-    write_ply(path, without_slivers(vertices, faces), faces, normals, attributes)
+    write_ply(path, without_slivers(vertices, faces, normals), faces, normals, attributes)
 
 
 def _write_views(output: Path, fit: FitScene, count: int) -> dict[str, float]:

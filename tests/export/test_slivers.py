@@ -9,6 +9,7 @@ from gshell_mi.export.slivers import without_slivers
 
 #: A fan around the last vertex, which nearly touches the edge from the first to the second.
 FACES = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+NORMALS = np.tile([0.0, 0, 1], (5, 1))
 
 
 def fan(height: float) -> np.ndarray:
@@ -27,14 +28,14 @@ def flatness(vertices: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("height", [1e-5, 0.0, -1e-5])
 def test_narrow_triangles_are_widened(height):
     """Also those without area, and those that lie turned over beneath the next."""
-    moved = without_slivers(fan(height), FACES)
+    moved = without_slivers(fan(height), FACES, NORMALS)
     np.testing.assert_array_equal(moved[:4], fan(height)[:4])
     assert 2e-3 <= flatness(moved).min() < 2.5e-3
     assert moved[4, 0] == pytest.approx(0.97) and moved[4, 2] == 0
 
 
 def test_what_is_wide_enough_stays():
-    np.testing.assert_array_equal(without_slivers(fan(0.01), FACES), fan(0.01))
+    np.testing.assert_array_equal(without_slivers(fan(0.01), FACES, NORMALS), fan(0.01))
 
 
 def interpolated(vertices: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -54,5 +55,5 @@ def interpolated(vertices: np.ndarray, x: np.ndarray) -> np.ndarray:
 def test_stock_mitsuba_interpolates_over_what_is_written():
     x = np.linspace(0.1, 0.9, 100)
     off = [np.abs(interpolated(vertices, x) - x).max()
-           for vertices in (fan(1e-5), without_slivers(fan(1e-5), FACES))]
+           for vertices in (fan(1e-5), without_slivers(fan(1e-5), FACES, NORMALS))]
     assert not off[0] < 0.1 and off[1] < 0.03

@@ -211,10 +211,10 @@ class JointStage:
         if not optimizer.state:
             return
         # One derivative that is no number would spread over all others, and stay in the optimiser for good.
-        for name in optimizer.keys():
-            dr.set_grad(optimizer[name], finite(dr.grad(optimizer[name])))
-        gradients = {name: dr.grad(optimizer[name]) for name in self.material.on_lattice}
-        for name, gradient in diffuse.together(gradients, config.material_gradient_smoothing).items():
+        gradients = {name: finite(dr.grad(optimizer[name])) for name in optimizer.keys()}
+        gradients |= diffuse.together({name: gradients[name] for name in self.material.on_lattice},
+                                      config.material_gradient_smoothing)
+        for name, gradient in gradients.items():
             dr.set_grad(optimizer[name], gradient)
         rates = dict.fromkeys(optimizer.keys(), decay_at(progress) * config.material_lr)
         if self.light and progress < config.color_hold:
