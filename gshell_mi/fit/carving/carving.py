@@ -144,7 +144,7 @@ def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.nd
             x, y, z = mi.Vector3u(dr.clip(dr.round((end + 1) / spacing), 0, mi.Float(side - 1)))
             hollow = dr.gather(mi.UInt32, labels, x + side * (y + side * z), deeper)
             for ghost, total in zip((before, after), sums, strict=True):
-                radiance, alpha = ghost.composite(ghost.sheets(ray), ray.d)
+                radiance, alpha = ghost.see(ray)
                 error = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
                 error = error.x + error.y + error.z + coverage * dr.abs(alpha - sample.alpha)
                 dr.scatter_reduce(dr.ReduceOp.Add, total, error, hollow, deeper)

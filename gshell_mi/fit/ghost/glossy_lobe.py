@@ -27,7 +27,7 @@ _REFLECTANCE = 0.04
 _BACK_GLOSS = -2.0
 
 
-PER_VERTEX = ("gloss_front", "gloss_back")
+PER_SIDE = "gloss"
 SHARED = ("fresnel", "surroundings")
 
 
@@ -39,21 +39,20 @@ def initial_lobe(vertex_count: int, radiance: float) -> dict[str, mi.Float]:
         radiance: mean radiance of the images, which the surroundings start from.
 
     Returns:
-        ``gloss_front`` and ``gloss_back``, one value per vertex; ``fresnel``, over the cosine; and
+        ``gloss``, (V, 2) of the front and the back of every vertex; ``fresnel``, over the cosine; and
         ``surroundings``, a latitude-longitude image, y up, interleaved colours.
     """
     cosine = np.linspace(0, 1, _NODES)
     schlick = _REFLECTANCE + (1 - _REFLECTANCE) * (1 - cosine) ** 5
     return {
-        "gloss_front": dr.zeros(mi.Float, vertex_count),
-        "gloss_back": dr.full(mi.Float, _BACK_GLOSS, vertex_count),
+        PER_SIDE: mi.Float(np.tile(np.float32([0, _BACK_GLOSS]), vertex_count)),
         "fresnel": mi.Float(np.log(schlick).astype(np.float32)),
         "surroundings": dr.full(mi.Float, float(np.log(max(radiance, 1e-3))), 3 * 2 * _HEIGHT * _HEIGHT),
     }
 
 
 def mirrored_radiance(lobe: Mapping[str, mi.Float], gloss: mi.Float, normal: mi.Vector3f,
-                      direction: mi.Vector3f, active: mi.Bool) -> mi.Color3f:
+                      direction: mi.Vector3f) -> mi.Color3f:
     """``gloss * fresnel(cosine) * surroundings(mirrored direction)``: what comes back along a ray.
 
     Args:
@@ -61,22 +60,21 @@ def mirrored_radiance(lobe: Mapping[str, mi.Float], gloss: mi.Float, normal: mi.
         gloss: its logarithm where the ray hits.
         normal: on the side that the ray comes from; unit length.
         direction: of the ray.
-        active: other lanes return 0.
     """
     cosine = dr.clip(-dr.dot(normal, direction), 0, 1)
     mirrored = direction + 2 * cosine * normal
-    factor = dr.exp(_fresnel(lobe["fresnel"], cosine, active) + gloss)
-    return dr.select(active, factor * dr.exp(_surroundings(lobe["surroundings"], mirrored, active)), 0)
+    factor = dr.exp(_fresnel(lobe["fresnel"], cosine) + gloss)
+    return factor * dr.exp(_surroundings(lobe["surroundings"], mirrored))
 
 
-def _fresnel(curve: mi.Float, cosine: mi.Float, active: mi.Bool) -> mi.Float:
+def _fresnel(curve: mi.Float, cosine: mi.Float) -> mi.Float:
     position = cosine * (_NODES - 1)
     node = dr.minimum(mi.UInt32(position), _NODES - 2)
-    low, high = (dr.gather(mi.Float, curve, node + i, active) for i in range(2))
+    low, high = (dr.gather(mi.Float, curve, node + i) for i in range(2))
     return dr.lerp(low, high, position - node)
 
 
-def _surroundings(image: mi.Float, direction: mi.Vector3f, active: mi.Bool) -> mi.Color3f:
+def _surroundings(image: mi.Float, direction: mi.Vector3f) -> mi.Color3f:
     width = 2 * _HEIGHT
     v = dr.safe_acos(direction.y) * (_HEIGHT / dr.pi) - 0.5
     u = (dr.atan2(direction.x, direction.z) / dr.two_pi + 0.5) * width - 0.5
@@ -85,7 +83,7 @@ def _surroundings(image: mi.Float, direction: mi.Vector3f, active: mi.Bool) -> m
     def texel(x: mi.Int32, y: mi.Int32) -> mi.Color3f:
         x = dr.select(x < 0, x + width, dr.select(x >= width, x - width, x))
         index = dr.clip(y, 0, _HEIGHT - 1) * width + x
-        return dr.gather(mi.Color3f, image, mi.UInt32(index), active)
+        return dr.gather(mi.Color3f, image, mi.UInt32(index))
 
     upper, lower = (dr.lerp(texel(column, row + i), texel(column + 1, row + i), u - column) for i in range(2))
     return dr.lerp(upper, lower, v - row)

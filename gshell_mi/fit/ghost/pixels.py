@@ -1,4 +1,4 @@
-"""All targets' pixels in one buffer, sampled at random across views."""
+"""The targets' pixels that may show the object in one buffer, sampled at random across views."""
 
 from __future__ import annotations
 
@@ -7,12 +7,19 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy import ndimage
 
 from ...targets import Target
 from ...views import PinholeViews
 
 #: Coverage of a pixel from which on nothing of the background is in it.
 COVERED = 0.99
+
+#: Less coverage is taken for noise.
+_FAINT = 0.01
+
+#: Pixels this near to a mask are drawn, too: a template that is still to move may reach beyond it.
+_MARGIN = 3
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,9 @@ class PixelSample:
 class PixelPool:
     """The pixels of targets, whatever their sizes, each equally likely to be drawn.
 
+    All templates lie within the visual hull, so rays far outside the masks meet nothing, and nothing is to be
+    learnt from them. On most photographs those are most pixels. They count, but are not drawn.
+
     Args:
         views: the cameras.
         targets: their images.
@@ -43,19 +53,24 @@ class PixelPool:
     def __init__(self, views: PinholeViews, targets: list[Target], chosen: np.ndarray | None = None):
         chosen = np.arange(len(views)) if chosen is None else chosen
         targets = [targets[index] for index in chosen]
-        counts = views.sizes[chosen].prod(axis=1)
-        self._pixels = mi.Float(np.concatenate([target.rgba.ravel() for target in targets]))
-        self._view = mi.UInt32(np.repeat(chosen, counts))
-        self._width = mi.UInt32(views.sizes[:, 0])
-        self._height = mi.UInt32(views.sizes[:, 1])
-        first = np.zeros(len(views), np.int64)
-        first[chosen] = np.cumsum(counts) - counts
-        self._first = mi.UInt32(first)
-        self.count = int(counts.sum())
+        near = [_near_object(target) for target in targets]
+        rgba = np.concatenate([target.rgba[where] for target, where in zip(targets, near, strict=True)])
+        self._pixels = mi.Float(rgba.ravel())
+        self._view = mi.UInt32(np.repeat(chosen, [np.count_nonzero(where) for where in near]))
+        row, column = np.concatenate([np.argwhere(where) for where in near]).T.astype(np.float32)
+        self._corner = mi.Point2f(column, row)
+        self._size = mi.Vector2f(views.sizes.T.astype(np.float32))
+        self._count = len(row)
+        self._share = self._count / int(views.sizes[chosen].prod(axis=1).sum())
         self.has_alpha = all(target.has_alpha for target in targets)
         color = sum(float(target.rgba[..., :3].sum(dtype=np.float64)) for target in targets)
         coverage = sum(float(target.rgba[..., 3].sum(dtype=np.float64)) for target in targets)
         self._mean_radiance = color / max(3 * coverage, 1e-6)
+
+    @property
+    def share(self) -> mi.Float:
+        """Fraction of the pixels that are drawn: a mean over a sample, times this, is one over all."""
+        return dr.opaque(mi.Float, self._share)
 
     def mean_radiance(self) -> float:
         """Mean over the covered pixels and the three channels."""
@@ -66,20 +81,27 @@ class PixelPool:
         return weight if self.has_alpha else 0.0
 
     def sample(self, count: int, *, seed: int, step: int) -> PixelSample:
-        """``count`` pixels; the same ones for the same ``seed`` and ``step``."""
+        """What is drawn of ``count`` pixels; the same for the same ``seed`` and ``step``."""
+        count = max(round(count * self._share), 1)
         # One stream per step: a resumed run draws what the uninterrupted one would have drawn.
         random = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed), initseq=_sequence(count, step))
-        pixel = dr.minimum(mi.UInt32(random.next_float32() * self.count), self.count - 1)
+        most = dr.opaque(mi.UInt32, self._count - 1)
+        pixel = dr.minimum(mi.UInt32(random.next_float32() * dr.opaque(mi.Float, self._count)), most)
         view = dr.gather(mi.UInt32, self._view, pixel)
-        local = pixel - dr.gather(mi.UInt32, self._first, view)
-        width, height = dr.gather(mi.UInt32, self._width, view), dr.gather(mi.UInt32, self._height, view)
-        row = local // width
-        column = local - row * width
-        film = mi.Point2f((column + random.next_float32()) / width, (row + random.next_float32()) / height)
+        corner = dr.gather(mi.Point2f, self._corner, pixel)
+        film = mi.Point2f(corner + mi.Vector2f(random.next_float32(), random.next_float32()))
+        film /= dr.gather(mi.Vector2f, self._size, view)
         rgba = dr.gather(mi.Vector4f, self._pixels, pixel)
         sample = PixelSample(view, film, mi.Color3f(rgba.x, rgba.y, rgba.z), rgba.w)
         dr.eval(sample.view, sample.film, sample.radiance, sample.alpha)
         return sample
+
+
+def _near_object(target: Target) -> np.ndarray:
+    """(height, width) whether a ray through a pixel may meet the visual hull, which bridges holes."""
+    mask = ndimage.binary_fill_holes(target.rgba[..., 3] > _FAINT)
+    near = ndimage.maximum_filter(mask, 2 * _MARGIN + 1)
+    return near if near.any() else np.ones_like(near)
 
 
 def _sequence(count: int, step: int) -> mi.UInt64:

@@ -25,9 +25,10 @@ from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
 from ..config import FitConfig
 from .contrast import Contrast
-from .glossy_lobe import PER_VERTEX, SHARED, initial_lobe, mirrored_radiance
+from .glossy_lobe import PER_SIDE, SHARED, initial_lobe, mirrored_radiance
 from .mesh_normals import vertex_normals
 from .pixels import COVERED, PixelPool, PixelSample
+from .sheets import Sheet, trace_sheets
 
 #: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
 #: enough that all are seen; colours fitted at full opacity would bleed what is inside into the caps.
@@ -54,9 +55,6 @@ _EXTRA_STEP = 1 << 20
 #: The lobe learns slower than the radiance by this factor: it is to explain what that cannot.
 _LOBE_RATE = 0.4
 
-SIDES = ("front", "back")
-
-
 class RadianceGhost:
     """Opacity and two-sided radiance on a fixed mesh, trained on random pixels of all views.
 
@@ -82,8 +80,8 @@ class RadianceGhost:
         self._tone = Contrast(pixels.mean_radiance())
         grey = inverse_softplus(pixels.mean_radiance())
         self.optimizer = mi.ad.Adam(lr=config.ghost_lr)
-        for side in SIDES:
-            self.optimizer[side] = dr.full(mi.Float, grey, 3 * self.vertex_count)
+        #: (V, 2, 3): of the front and the back of every vertex.
+        self.optimizer["radiance"] = dr.full(mi.Float, grey, 6 * self.vertex_count)
         if glossy:
             for name, values in initial_lobe(self.vertex_count, pixels.mean_radiance()).items():
                 self.optimizer[name] = values
@@ -96,12 +94,13 @@ class RadianceGhost:
         config, optimizer = self.config, self.optimizer
         progress = iteration / config.ghost_iterations
         sample, radiance, alpha, _ = self._render(iteration)
-        image = losses.l1(self._tone(radiance), self._tone(sample.radiance))
-        mask = losses.mask_l2(alpha, sample.alpha)
+        share = self.pixels.share
+        image = share * losses.l1(self._tone(radiance), self._tone(sample.radiance))
+        mask = share * losses.mask_l2(alpha, sample.alpha)
         # Where a mask shows daylight within the hull, every sheet on the ray is open: no doubt, no balance.
-        daylight = losses.mask_l2(dr.select(sample.alpha < 0.01, alpha, 0), 0)
+        daylight = share * losses.mask_l2(dr.select(sample.alpha < 0.01, alpha, 0), 0)
         opacity = sigmoid(optimizer["opacity"])
-        front, back = (dr.unravel(mi.Color3f, softplus(optimizer[side])) for side in SIDES)
+        front, back = (softplus(side) for side in self._sides())
         # Undecided opacity must have its say first; only then is it made to decide.
         late = dr.opaque(mi.Float, max(0.0, 2 * progress - 1))
         total = (
@@ -113,8 +112,8 @@ class RadianceGhost:
             + config.ghost_chroma * losses.chroma_difference(front, back)
         )
         dr.backward(total)
-        self.update(("opacity", *SIDES), config.ghost_lr * decay_at(progress))
-        error = mean(dr.square(dr.detach(radiance) - sample.radiance))
+        self.update(("opacity", "radiance"), config.ghost_lr * decay_at(progress))
+        error = share * mean(dr.square(dr.detach(radiance) - sample.radiance))
         return {"loss": total[0], "image": image[0], "mask": mask[0],
                 "psnr": decibels(error[0])}
 
@@ -130,7 +129,7 @@ class RadianceGhost:
         for step in range(_REFIT_STEPS):
             sample, radiance, _, _ = self._render(_EXTRA_STEP + step)
             dr.backward(losses.l1(self._tone(radiance), self._tone(sample.radiance)))
-            self.update(SIDES, self.config.ghost_lr)
+            self.update(("radiance",), self.config.ghost_lr)
 
     def image_error(self, opaque: np.ndarray) -> np.ndarray:
         """How badly the images are explained through each vertex if just the vertices ``opaque`` are.
@@ -146,11 +145,14 @@ class RadianceGhost:
             for step in range(_ERROR_STEPS):
                 sample, radiance, _, sheets = self._render(_EXTRA_STEP + _REFIT_STEPS + step)
                 difference = dr.abs(self._tone(radiance) - self._tone(sample.radiance))
-                hit, face, weights, _ = sheets[0]
-                for total, counts in zip(sums, (hit, hit & (sample.alpha > COVERED)), strict=True):
-                    for corner in range(3):
-                        share = weights[corner] * (difference.x + difference.y + difference.z)
-                        dr.scatter_reduce(dr.ReduceOp.Add, total, share, face[corner], counts)
+                if not sheets:
+                    continue
+                first = sheets[0]
+                error = dr.gather(mi.Float, difference.x + difference.y + difference.z, first.lane)
+                covered = dr.gather(mi.Float, sample.alpha, first.lane) > COVERED
+                for total, counts in zip(sums, (mi.Bool(True), covered), strict=True):
+                    for weight, corner in zip(first.weights, first.face, strict=True):
+                        dr.scatter_reduce(dr.ReduceOp.Add, total, weight * error, corner, counts)
                 dr.eval(sums)
         return np.stack([total.numpy() for total in sums])
 
@@ -161,7 +163,7 @@ class RadianceGhost:
             for step in range(_ERROR_STEPS):
                 sample = pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
                 ray = self.views.rays(sample.view, sample.film)
-                radiance, _ = self.composite(self.sheets(ray), ray.d)
+                radiance, _ = self.see(ray)
                 total += losses.log_l1(radiance, sample.radiance)
                 dr.eval(total)
         return float(total[0]) / _ERROR_STEPS
@@ -178,28 +180,31 @@ class RadianceGhost:
         self.optimizer["opacity"] = mi.Float(logits.astype(np.float32))
         self.optimizer.reset()
 
-    def _render(self, step: int) -> tuple:
+    def _render(self, step: int) -> tuple[PixelSample, mi.Color3f, mi.Float, list[Sheet]]:
         """The random pixels of a step, their radiance and coverage, and the sheets behind them."""
-        sample, ray, sheets = self.look(step)
-        radiance, alpha = self.composite(sheets, ray.d)
+        sample, sheets = self.look(step)
+        radiance, alpha = self.composite(sheets, dr.width(sample.view))
         # Each of the losses would do this again.
         dr.eval(radiance, alpha)
         return sample, radiance, alpha, sheets
 
-    def look(self, step: int) -> tuple[PixelSample, mi.Ray3f, list[tuple]]:
-        """The random pixels of a step, the rays through them and the sheets that these meet."""
+    def look(self, step: int) -> tuple[PixelSample, list[Sheet]]:
+        """The random pixels of a step, and the sheets that the rays through them meet."""
         sample = self.pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
-        ray = self.views.rays(sample.view, sample.film)
-        return sample, ray, self.sheets(ray)
+        return sample, self._sheets(self.views.rays(sample.view, sample.film))
+
+    def see(self, ray: mi.Ray3f) -> tuple[mi.Color3f, mi.Float]:
+        """Radiance and coverage along rays."""
+        return self.composite(self._sheets(ray), dr.width(ray.d))
 
     def update(self, names: tuple[str, ...], rate: float) -> None:
         """Steps the parameters ``names`` and the lobe; the others rest.
 
         Values of the vertices move along their Sobolev gradients.
         """
-        rates = dict.fromkeys(("opacity", *SIDES), 0.0) | dict.fromkeys(names, rate)
+        rates = dict.fromkeys(("opacity", "radiance"), 0.0) | dict.fromkeys(names, rate)
         if self.glossy:
-            rates |= dict.fromkeys((*PER_VERTEX, *SHARED), _LOBE_RATE * rate)
+            rates |= dict.fromkeys((PER_SIDE, *SHARED), _LOBE_RATE * rate)
         gradients = {name: dr.grad(self.optimizer[name]) for name, value in rates.items() if value}
         gradients |= self._smooth.together({name: gradient for name, gradient in gradients.items()
                                             if name not in SHARED})
@@ -220,7 +225,7 @@ class RadianceGhost:
 
     def radiance(self) -> tuple[np.ndarray, np.ndarray]:
         """(V, 3) front and back radiance."""
-        return tuple(softplus(self.optimizer[side]).numpy().reshape(-1, 3) for side in ("front", "back"))
+        return tuple(softplus(self.optimizer["radiance"]).numpy().reshape(-1, 2, 3).swapaxes(0, 1))
 
     def preview(self) -> Preview:
         """The part of the mesh that is not clearly fading, in the radiance of its front."""
@@ -228,70 +233,69 @@ class RadianceGhost:
         kept = dr.detach(self.optimizer["opacity"]).numpy() > 2 * _INITIAL_LOGIT
         return Preview(vertices, faces[kept[faces].all(axis=1)], self.radiance()[0], vertices, faces)
 
-    def sheets(self, ray: mi.Ray3f) -> list[tuple]:
-        """The first sheets along each ray: (hit?, vertex indices, barycentric weights, front side?).
+    def _sides(self) -> tuple[mi.Color3f, mi.Color3f]:
+        """Of every vertex, what the softplus makes radiance of: front and back."""
+        vertex = dr.arange(mi.UInt32, self.vertex_count)
+        return tuple(dr.gather(mi.Color3f, self.optimizer["radiance"], 2 * vertex + side,
+                               mode=dr.ReduceMode.Permute) for side in range(2))
+
+    def _sheets(self, ray: mi.Ray3f) -> list[Sheet]:
+        """The first sheets along each ray.
 
         There are none behind sheets that let nothing through, unless their opacity is still to be found: for
         that, what they hide counts as well.
         """
-        sheets = []
-        opacity = dr.detach(self.optimizer["opacity"])
-        active, transmittance = dr.full(mi.Bool, True, dr.width(ray.o)), mi.Float(1)
-        for _ in range(self.config.ghost_sheets):
-            hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-            active = hit.is_valid()
-            face = mi.Vector3u(*(dr.gather(mi.UInt32, corner, hit.prim_index, active)
-                                 for corner in self._faces))
-            a, b, c = (dr.gather(mi.Point3f, self._positions, face[i], active) for i in range(3))
-            front = dr.dot(dr.cross(b - a, c - a), ray.d) < 0
-            # Barycentrics of a miss are not a number, and 0 times that is no 0.
-            uv = dr.select(active, hit.prim_uv, 0)
-            weights = mi.Vector3f(1 - uv.x - uv.y, uv.x, uv.y)
-            sheets.append((active, face, weights, front))
-            transmittance *= 1 - sigmoid(_interpolated(opacity, face, weights, active))
-            if self._opacity_rests:
-                active = active & (transmittance > _NEGLIGIBLE)
-            ray = mi.Ray3f(ray.o + ray.d * dr.select(active, hit.t + self._offset, 0), ray.d)
-        dr.eval(sheets)
-        return sheets
+        opacity, transmittance = dr.detach(self.optimizer["opacity"]), dr.full(mi.Float, 1, dr.width(ray.d))
 
-    def composite(self, sheets: list[tuple], direction: mi.Vector3f) -> tuple[mi.Color3f, mi.Float]:
-        """Front-to-back compositing (Porter and Duff 1984, *over*) of radiance and coverage.
+        def goes_on(sheet: Sheet) -> mi.Bool:
+            nonlocal transmittance
+            remaining = dr.gather(mi.Float, transmittance, sheet.lane)
+            transmittance = remaining * (1 - sigmoid(sheet.interpolate(opacity)))
+            dr.eval(transmittance)
+            return transmittance > _NEGLIGIBLE
+
+        return trace_sheets(self.scene, self._positions, self._faces, ray, self.config.ghost_sheets,
+                            self._offset, goes_on if self._opacity_rests else None)
+
+    def composite(self, sheets: list[Sheet], count: int) -> tuple[mi.Color3f, mi.Float]:
+        """Compositing (Porter and Duff 1984, *over*) of radiance and coverage.
 
         Args:
             sheets: what the rays meet, from ``look``.
-            direction: of the rays.
+            count: of rays.
+
+        Returns:
+            Radiance and coverage of every ray.
         """
         opacity = self.optimizer["opacity"]
         if self._opacity_rests:
             opacity = dr.detach(opacity)  # its derivatives would take as long as those of the radiance
         radiance, transmittance = mi.Color3f(0), mi.Float(1)
-        for sheet in sheets:
-            hit, face, weights, is_front = sheet
-            logit, color = _interpolated(opacity, face, weights, hit), mi.Color3f(0)
-            for weight, corner in zip(weights, face, strict=True):
-                for side, seen in zip(SIDES, (hit & is_front, hit & ~is_front), strict=True):
-                    color += weight * dr.gather(mi.Color3f, self.optimizer[side], corner, seen)
-            alpha = dr.select(hit, sigmoid(logit), 0)
+        fronts = [count, *(dr.width(sheet.lane) for sheet in sheets)]
+        # From the last to the first: each has lanes of its own.
+        for sheet, width in reversed(list(zip(sheets, fronts, strict=False))):
+            color = mi.Color3f(0)
+            for weight, corner in zip(sheet.weights, sheet.face, strict=True):
+                color += weight * dr.gather(mi.Color3f, self.optimizer["radiance"], sheet.side(corner))
             color = softplus(color)
             if self.glossy:
-                color += self._mirrored(sheet, direction)
-            radiance += transmittance * alpha * color
-            transmittance *= 1 - alpha
+                color += self._mirrored(sheet)
+            alpha = sigmoid(sheet.interpolate(opacity))
+            radiance = _spread(dr.lerp(radiance, color, alpha), sheet.lane, 0, width)
+            transmittance = _spread((1 - alpha) * transmittance, sheet.lane, 1, width)
         return radiance, 1 - transmittance
 
-    def _mirrored(self, sheet: tuple, direction: mi.Vector3f) -> mi.Color3f:
+    def _mirrored(self, sheet: Sheet) -> mi.Color3f:
         """What the lobe adds to the radiance of a sheet."""
-        hit, face, weights, is_front = sheet
         gloss, normal = mi.Float(0), mi.Vector3f(0)
-        for weight, corner in zip(weights, face, strict=True):
-            for side, seen in zip(PER_VERTEX, (hit & is_front, hit & ~is_front), strict=True):
-                gloss += weight * dr.gather(mi.Float, self.optimizer[side], corner, seen)
+        for weight, corner in zip(sheet.weights, sheet.face, strict=True):
+            gloss += weight * dr.gather(mi.Float, self.optimizer[PER_SIDE], sheet.side(corner))
             # The lobe is to explain highlights, not to turn the surface.
-            normal += dr.detach(weight) * dr.gather(mi.Vector3f, self._normals, corner, hit)
+            normal += dr.detach(weight) * dr.gather(mi.Vector3f, self._normals, corner)
         length = dr.norm(normal)
-        normal = dr.select(length > 1e-3, normal / length, -direction)
-        return mirrored_radiance(self.optimizer, gloss, dr.select(is_front, normal, -normal), direction, hit)
+        normal = dr.select(length > 1e-3, normal / length, -sheet.direction)
+        return mirrored_radiance(self.optimizer, gloss, dr.select(sheet.front, normal, -normal),
+                                 sheet.direction)
 
     def _smooth_normals(self) -> mi.Float:
         """(3 V,) unit normals, as smooth as the other values at the vertices."""
@@ -299,7 +303,8 @@ class RadianceGhost:
         return dr.ravel(normals / dr.maximum(dr.norm(normals), 1e-12))
 
 
-def _interpolated(values: mi.Float, face: mi.Vector3u, weights: mi.Vector3f, active: mi.Bool) -> mi.Float:
-    """One value per vertex at the points that the barycentric weights give."""
-    return sum(weight * dr.gather(mi.Float, values, corner, active)
-               for weight, corner in zip(weights, face, strict=True))
+def _spread(values, lane: mi.UInt32, rest: float, count: int):
+    """``values`` on their lanes of ``count``, and ``rest`` on all others."""
+    target = dr.full(type(values), rest, count)
+    dr.scatter(target, values, lane, mode=dr.ReduceMode.Permute)
+    return target

@@ -9,6 +9,8 @@ material, hence no noise, and a step looks at all views at once.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -22,7 +24,8 @@ from ...schedules import falling
 from ...triangles import face_areas
 from ..bookkeeping.observer import Preview
 from ..config import FitConfig
-from ..ghost.radiance_ghost import SIDES, RadianceGhost
+from ..ghost.radiance_ghost import RadianceGhost
+from ..ghost.sheets import Sheet
 from .outlines import Outlines
 
 #: Views whose outlines a step compares.
@@ -65,11 +68,11 @@ class PhotometricRefinement:
         progress = iteration / config.refinement_iterations
         positions = optimizer["positions"]
         ghost.move(dr.detach(positions))
-        sample, ray, sheets = ghost.look(iteration)
-        attached = [(hit, face, _barycentric(positions, face, weights, ray, hit), front)
-                    for hit, face, weights, front in sheets]
-        radiance, _ = ghost.composite(attached, ray.d)
-        image = losses.log_l1(radiance, sample.radiance)
+        sample, sheets = ghost.look(iteration)
+        attached = [replace(sheet, weights=_barycentric(positions, sheet)) for sheet in sheets]
+        radiance, _ = ghost.composite(attached, dr.width(sample.view))
+        share = ghost.pixels.share
+        image = share * losses.log_l1(radiance, sample.radiance)
         total, outline = image, mi.Float(0)
         if self.outlines:
             chosen = np.random.default_rng((config.seed, iteration)).permutation(len(ghost.views))
@@ -78,8 +81,8 @@ class PhotometricRefinement:
             total = total + dr.opaque(mi.Float, (1 - progress / 2) * config.refinement_outline) * outline
         dr.backward(total)
         self._move(progress, iteration)
-        ghost.update(SIDES, config.refinement_radiance_lr)
-        error = mean(dr.square(dr.detach(radiance) - sample.radiance))
+        ghost.update(("radiance",), config.refinement_radiance_lr)
+        error = share * mean(dr.square(dr.detach(radiance) - sample.radiance))
         return {"loss": total[0], "image": image[0], "outline": outline[0],
                 "psnr": decibels(error[0])}
 
@@ -104,16 +107,15 @@ class PhotometricRefinement:
         optimizer.step()
 
 
-def _barycentric(positions: mi.Float, face: mi.Vector3u, weights: mi.Vector3f, ray: mi.Ray3f,
-                 hit: mi.Bool) -> mi.Vector3f:
-    """The weights of a ray's hit, attached to the triangle's vertices (Möller and Trumbore 1997)."""
-    a, b, c = (dr.gather(mi.Point3f, positions, face[i], hit) for i in range(3))
-    ab, ac, to_origin = b - a, c - a, ray.o - a
-    across = dr.cross(ray.d, ac)
+def _barycentric(positions: mi.Float, sheet: Sheet) -> mi.Vector3f:
+    """The weights of the rays' hits, attached to the triangles' vertices (Möller and Trumbore 1997)."""
+    a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in sheet.face)
+    ab, ac, to_origin = b - a, c - a, sheet.origin - a
+    across = dr.cross(sheet.direction, ac)
     determinant = dr.dot(ab, across)
-    usable = hit & (dr.abs(dr.detach(determinant)) > 1e-12)
+    usable = dr.abs(dr.detach(determinant)) > 1e-12
     scale = dr.rcp(dr.select(usable, determinant, 1))
     u = dr.select(usable, dr.dot(to_origin, across) * scale, 0)
-    v = dr.select(usable, dr.dot(ray.d, dr.cross(to_origin, ab)) * scale, 0)
-    u, v = dr.replace_grad(weights.y, u), dr.replace_grad(weights.z, v)
+    v = dr.select(usable, dr.dot(sheet.direction, dr.cross(to_origin, ab)) * scale, 0)
+    u, v = dr.replace_grad(sheet.weights.y, u), dr.replace_grad(sheet.weights.z, v)
     return mi.Vector3f(1 - u - v, u, v)

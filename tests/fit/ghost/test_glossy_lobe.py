@@ -16,7 +16,7 @@ from gshell_mi.views import PinholeViews
 
 def reflected(lobe, normal, direction, gloss=0.0):
     normal, direction = (dr.normalize(mi.Vector3f(list(map(float, v)))) for v in (normal, direction))
-    return np.ravel(mirrored_radiance(lobe, mi.Float(gloss), normal, direction, mi.Bool(True)))
+    return np.ravel(mirrored_radiance(lobe, mi.Float(gloss), normal, direction))
 
 
 def test_at_first_it_is_schlick_under_an_even_sky():

@@ -49,8 +49,8 @@ def sheets() -> RadianceGhost:
     """Opacities 0.3 and 0.6, constant radiance of each side of each sheet."""
     ghost = RadianceGhost(*two_sheets(), *unused_views(), CONFIG)
     ghost.optimizer["opacity"] = mi.Float(np.repeat(logit(np.array([0.3, 0.6])), 4))
-    ghost.optimizer["front"] = mi.Float(np.repeat(inverse_softplus(FRONT), 4, axis=0).ravel())
-    ghost.optimizer["back"] = mi.Float(np.repeat(inverse_softplus(BACK), 4, axis=0).ravel())
+    both_sides = np.stack([FRONT, BACK], axis=1)
+    ghost.optimizer["radiance"] = mi.Float(np.repeat(inverse_softplus(both_sides), 4, axis=0).ravel())
     return ghost
 
 
@@ -60,7 +60,7 @@ BACK = np.array([[0.3, 0.3, 3.0], [0.7, 0.2, 0.6]])
 
 def composite(ghost, origin, direction):
     ray = mi.Ray3f(origin, direction)
-    radiance, alpha = ghost.composite(ghost.sheets(ray), ray.d)
+    radiance, alpha = ghost.see(ray)
     return np.ravel(radiance), np.ravel(alpha)[0]
 
 
@@ -99,7 +99,7 @@ def test_derivatives_of_coverage(sheets):
     dr.enable_grad(opacity)
     old, sheets.optimizer["opacity"] = sheets.optimizer["opacity"], opacity
     ray = mi.Ray3f([0.1, 0.2, 5], [0, 0, -1])
-    _, alpha = sheets.composite(sheets.sheets(ray), ray.d)
+    _, alpha = sheets.see(ray)
     dr.backward(alpha)
     gradient = dr.grad(sheets.optimizer["opacity"]).numpy().reshape(2, 4).sum(1)
     sheets.optimizer["opacity"] = dr.detach(old)

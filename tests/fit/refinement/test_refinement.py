@@ -9,6 +9,7 @@ import trimesh
 from gshell_mi.fit.config import FitConfig
 from gshell_mi.fit.ghost.pixels import PixelPool
 from gshell_mi.fit.ghost.radiance_ghost import RadianceGhost
+from gshell_mi.fit.ghost.sheets import Sheet
 from gshell_mi.fit.refinement.outlines import Outlines
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement, _barycentric
 from gshell_mi.targets import Target
@@ -128,10 +129,10 @@ def test_outline_loss_derivative_is_that_of_a_scaled_sphere(capture):
 
 def test_attached_barycentrics():
     positions = mi.Float([0, 0, 0, 1, 0, 0, 0, 1, 0])
-    face = mi.Vector3u(0, 1, 2)
-    ray = mi.Ray3f(mi.Point3f(0.25, 0.5, 1), mi.Vector3f(0, 0, -1))
+    hit = Sheet(mi.UInt32(0), mi.Point3f(0.25, 0.5, 1), mi.Vector3f(0, 0, -1), mi.Vector3u(0, 1, 2),
+                mi.Vector3f(0.25, 0.25, 0.5), mi.Bool(True))
     dr.enable_grad(positions)
-    weights = _barycentric(positions, face, mi.Vector3f(0.25, 0.25, 0.5), ray, mi.Bool(True))
+    weights = _barycentric(positions, hit)
     assert np.allclose(dr.detach(weights).numpy().ravel(), [0.25, 0.25, 0.5])
     dr.backward(weights.y)  # x over the length of the first edge
     # Moving the corner at the origin along x by h: u = (0.25 - 0.5 h ...) by hand, du/dx0 = u - 1 + v.

@@ -1,0 +1,75 @@
+"""The sheets of a template that rays meet one behind the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class Sheet:
+    """Where rays meet a template for the first time, the second, and so on; one lane per ray that does.
+
+    Attributes:
+        lane: of the ray among those of the sheet in front; among all rays for the first.
+        origin, direction: of the ray; the origin lies behind the sheet in front.
+        face: vertex indices of the triangle.
+        weights: barycentric.
+        front: whether the ray comes from the side that the triangle's normal points to.
+    """
+
+    lane: mi.UInt32
+    origin: mi.Point3f
+    direction: mi.Vector3f
+    face: mi.Vector3u
+    weights: mi.Vector3f
+    front: mi.Bool
+
+    def interpolate(self, values: mi.Float) -> mi.Float:
+        """One value per vertex at the hits."""
+        return sum(weight * dr.gather(mi.Float, values, corner)
+                   for weight, corner in zip(self.weights, self.face, strict=True))
+
+    def side(self, corner: mi.UInt32) -> mi.UInt32:
+        """Of a corner, the place of the side that is seen among values (V, 2): front, then back."""
+        return 2 * corner + dr.select(self.front, mi.UInt32(0), mi.UInt32(1))
+
+
+def trace_sheets(scene: mi.Scene, positions: mi.Float, faces: mi.Vector3u, ray: mi.Ray3f, count: int,
+                 offset: float, goes_on: Callable[[Sheet], mi.Bool] | None = None) -> list[Sheet]:
+    """The first sheets along each ray.
+
+    Only the rays that go on are traced any further, and only hits have lanes: of a closed template every ray
+    that hits has a second sheet, but few have a fourth.
+
+    Args:
+        scene: of the template alone.
+        positions: (3 V,) of its vertices.
+        faces: its triangles.
+        ray: to follow.
+        count: of sheets, at most.
+        offset: between a sheet and where its ray goes on, world units.
+        goes_on: of a sheet, which of its rays pass it; None for all.
+    """
+    sheets = []
+    origin, direction, active = ray.o, ray.d, mi.Bool(True)
+    for _ in range(count):
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
+        found, ray = hit.is_valid(), (origin, direction, hit.t, hit.prim_uv, hit.prim_index)
+        dr.eval(found, ray)  # in one kernel: what is gathered from is evaluated one by one
+        lane = dr.compress(found)
+        if not dr.width(lane):
+            break
+        origin, direction, t, uv, prim = (dr.gather(type(value), value, lane) for value in ray)
+        face = dr.gather(mi.Vector3u, faces, prim)
+        a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in face)
+        front = dr.dot(dr.cross(b - a, c - a), direction) < 0
+        sheet = Sheet(lane, origin, direction, face, mi.Vector3f(1 - uv.x - uv.y, uv.x, uv.y), front)
+        sheets.append(sheet)
+        active = goes_on(sheet) if goes_on else mi.Bool(True)
+        origin = mi.Point3f(origin + direction * (t + offset))
+        dr.eval(sheet, origin, direction, active)
+    return sheets

@@ -1,0 +1,72 @@
+"""Random pixels: which are drawn, and what a mean over them stands for."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from gshell_mi.fit.ghost.pixels import PixelPool
+from gshell_mi.targets import Target
+from gshell_mi.views import PinholeViews
+
+#: Width and height of the two views' images.
+SIZES = (64, 48), (80, 60)
+
+
+def views() -> PinholeViews:
+    return PinholeViews.from_sensors([
+        mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": width, "height": height}})
+        for width, height in SIZES])
+
+
+def ring(width: int, height: int) -> Target:
+    """A ring around the centre of an image. Red is the column and green the row, where it is covered."""
+    row, column = np.mgrid[:height, :width].astype(np.float32)
+    distance = np.hypot(column + 0.5 - width / 2, row + 0.5 - height / 2)
+    covered = ((distance > 6) & (distance < 12)).astype(np.float32)
+    return Target(None, np.stack([covered * column, covered * row, covered, covered], axis=-1), True)
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    pool = PixelPool(views(), [ring(*size) for size in SIZES])
+    return pool, pool.sample(1 << 16, seed=3, step=5)
+
+
+def test_pixels_are_those_at_the_film_positions(drawn):
+    _, sample = drawn
+    size = np.array(SIZES)[sample.view.numpy()].T
+    column, row = np.floor(sample.film.numpy() * size)
+    covered = sample.alpha.numpy() > 0
+    np.testing.assert_array_equal(sample.radiance.numpy()[:2], [covered * column, covered * row])
+
+
+def test_far_from_the_masks_nothing_is_drawn_but_their_holes_are(drawn):
+    _, sample = drawn
+    size = np.array(SIZES)[sample.view.numpy()].T
+    distance = np.hypot(*(np.floor(sample.film.numpy() * size) + 0.5 - size / 2))
+    assert distance.max() < 12 + 3 * np.sqrt(2)
+    assert distance.min() < 1
+
+
+def test_a_mean_times_the_share_is_one_over_all_pixels(drawn):
+    pool, sample = drawn
+    whole = np.concatenate([ring(*size).rgba.reshape(-1, 4) for size in SIZES])
+    assert pool.share[0] * sample.alpha.numpy().mean() == pytest.approx(whole[:, 3].mean(), rel=0.02)
+    assert pool.share[0] * sample.radiance.numpy()[0].mean() == pytest.approx(whole[:, 0].mean(), rel=0.02)
+    assert len(sample.alpha) == round((1 << 16) * pool.share[0]), "as many to a pixel as asked for"
+
+
+def test_without_masks_all_pixels_are_drawn():
+    targets = [Target(None, np.ones((height, width, 4), np.float32), False) for width, height in SIZES]
+    pool = PixelPool(views(), targets)
+    assert pool.share[0] == 1
+    sample = pool.sample(1 << 18, seed=0, step=0)
+    film = sample.film.numpy()[:, sample.view.numpy() == 1]
+    assert len(np.unique(np.floor(film * [[80], [60]]), axis=1).T) == 80 * 60
+
+
+def test_a_step_draws_the_same_again_and_another_step_others(drawn):
+    pool, sample = drawn
+    again, other = (pool.sample(1 << 16, seed=3, step=step).film.numpy() for step in (5, 6))
+    np.testing.assert_array_equal(again, sample.film.numpy())
+    assert (other != again).any(axis=0).mean() > 0.99
