@@ -169,7 +169,9 @@ class RadianceVolume:
         sample = self.pixels.sample(self.config.carving_batch, seed=self.config.seed, step=step)
         ray = self.views.rays(sample.view, sample.film)
         hit = self.scene.ray_intersect_preliminary(ray, coherent=False)
-        index = dr.compress(hit.is_valid())
+        found = hit.is_valid()
+        dr.eval(ray.o, ray.d, hit.t, found)  # in one kernel: what is gathered from is evaluated one by one
+        index = dr.compress(found)
         if not dr.width(index):
             index = mi.UInt32(0)  # a ray without steps: arrays are never empty
         # The others have nothing to march through.

@@ -80,10 +80,12 @@ class Outlines:
         point = ends[0] * (1 - t) + ends[1] * t
         film, depth = self.views.project(view, point)
         pixel = self.views.pixel_size(view) * dr.detach(depth)
-        beyond = dr.detach(point) + dr.normalize(dr.lerp(*turned, t)) * (_CLEARANCE * pixel)
-        outer = (depth > 0) & ~scene.ray_test(mi.Ray3f(origin, dr.normalize(beyond - origin)), coherent=False)
         distance = self._distance(view, film)
-        outer &= dr.abs(dr.detach(distance)) < _REACH
+        near = (depth > 0) & (dr.abs(dr.detach(distance)) < _REACH)
+        beyond = dr.detach(point) + dr.normalize(dr.lerp(*turned, t)) * (_CLEARANCE * pixel)
+        ray = mi.Ray3f(origin, dr.normalize(beyond - origin))
+        outer = near & ~scene.ray_test(ray, coherent=False, active=near)
+        dr.eval(outer)  # or both sums and the derivatives would trace rays
         squares = dr.select(outer, dr.square(distance * pixel), 0)
         return dr.sum(squares) / dr.maximum(dr.sum(dr.select(outer, mi.Float(1), 0)), 1)
 
