@@ -70,7 +70,7 @@ class FitConfig:
     ghost_iterations: int = 400
     """Steps of the radiance ghost."""
     ghost_batch: int = 65536
-    """Pixels per step, drawn over all views."""
+    """Pixels per step over all views, of which those far from the masks are left out."""
     ghost_sheets: int = 4
     """Sheets of the template that a ray composites."""
     ghost_lr: float = 0.1
@@ -98,7 +98,7 @@ class FitConfig:
     carving_iterations: int = 1000
     """Steps of the radiance volume; 0 leaves the hull as it is."""
     carving_batch: int = 65536
-    """Pixels per step, drawn over all views; those whose rays miss the hull cost little."""
+    """Pixels per step over all views, of which those far from the masks are left out."""
     carving_lr: float = 0.6
     """Adam's step for the density's logits; halves over the coarse steps, then falls tenfold."""
     carving_radiance_lr: float = 0.05

@@ -75,12 +75,14 @@ def explained(template: SurfaceMesh, scene: mi.Scene, integrator, views: Pinhole
             sample = pixels.sample(_BATCH, seed=seed, step=batch)
             ray = views.rays(sample.view, sample.film)
             hit = shell.ray_intersect_preliminary(ray, coherent=False)
-            index = dr.compress(hit.is_valid() & (sample.alpha > COVERED))
+            counts = hit.is_valid() & (sample.alpha > COVERED)
+            met = ray.o, ray.d, hit.t, hit.prim_index, hit.prim_uv, sample.radiance
+            dr.eval(counts, met)  # in one kernel: what is gathered from is evaluated one by one
+            index = dr.compress(counts)
             if dr.width(index) == 0:
                 continue
-            origin, direction, distance, prim, uv, target = (
-                dr.gather(type(value), value, index)
-                for value in (ray.o, ray.d, hit.t, hit.prim_index, hit.prim_uv, sample.radiance))
+            origin, direction, distance, prim, uv, target = (dr.gather(type(value), value, index)
+                                                             for value in met)
             rays = [mi.Ray3f(origin, direction)]
             if behind:
                 rays.append(mi.Ray3f(origin + direction * (distance + offset), direction))
