@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
+import gshell_mi  # noqa: F401  registers gshell_path
+
 
 @pytest.mark.parametrize("film", [
     {},
