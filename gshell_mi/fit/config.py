@@ -150,7 +150,7 @@ class FitConfig:
     flexicubes_weights: bool = False
     """Also optimise the 21 weights per cube of FlexiCubes, which makes a step slower by a tenth; the hat is
     none the better for it."""
-    iterations: int = 180
+    iterations: int = 210
     """Steps of the joint stage."""
     step_views: int = 3
     """Views that a step of the joint stage renders; it follows the mean of their losses. What a step takes
