@@ -108,7 +108,7 @@ class SecondLook:
 
         Growing must not change how many boundary loops there are. Where rims have met in the steps
         afterwards, a strip of the surface comes back. If that does not help, but undoing all does, all is
-        undone.
+        undone. If nothing helps, as loops have come or gone elsewhere, what comes nearest stays.
         """
         kept = self._state.get(f"{_PREFIX}kept")
         if kept is None or not kept.any():
@@ -116,19 +116,20 @@ class SecondLook:
             return None if kept is None else False
         self._join(kept)
         self.joint.finish()
+        tried = [(self._loops_off(kept), self._msdf())]
         for width in range(_STRIP + 1):
-            if self._has_its_loops(kept):
+            if tried[-1][0] == 0:
                 return True
             self._part(kept, width)
             self.joint.finish()
-        if self._has_its_loops(kept):
-            return True
-        self.joint.apply(geometry=True)
-        msdf = mi.Float(dr.detach(self.joint.subject.msdf))
-        self._undo(kept)
-        self.joint.finish()
-        if self._has_its_loops(np.zeros_like(kept)):
-            return False
+            tried.append((self._loops_off(kept), self._msdf()))
+        off, msdf = min(tried, key=lambda attempt: attempt[0])
+        if off:
+            self.joint.geometry.replace("msdf", tried[0][1])
+            self._undo(kept)
+            self.joint.finish()
+            if self._loops_off(np.zeros_like(kept)) < off:
+                return False
         self.joint.geometry.replace("msdf", msdf)
         self.joint.finish()
         return True
@@ -200,12 +201,15 @@ class SecondLook:
         before = self._state[f"{_PREFIX}values"][nearest]
         self._write(template, np.where(undone, before, values), undone)
 
-    def _has_its_loops(self, kept: np.ndarray) -> bool:
-        """Whether the surface has the loops from before but those of openings that were shut, and no more
-        pin-holes."""
+    def _loops_off(self, kept: np.ndarray) -> int:
+        """By how much the surface's loops differ from those before but those of openings that were shut, and
+        how many new pin-holes it has."""
         found = topology(*self.joint.subject.surface.to_numpy()[:2])
         loops, pinholes = self._state[f"{_PREFIX}loops"] - self._state[f"{_PREFIX}spent"][kept].sum(axis=0)
-        return found.boundary_loops == loops and found.pinholes <= max(pinholes, 0)
+        return int(abs(found.boundary_loops - loops) + max(found.pinholes - max(pinholes, 0), 0))
+
+    def _msdf(self) -> mi.Float:
+        return mi.Float(dr.detach(self.joint.subject.msdf))
 
     def _join(self, kept: np.ndarray) -> None:
         """Opens a narrow way to what has opened in the patches that were kept and lies apart."""

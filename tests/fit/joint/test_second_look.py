@@ -301,21 +301,44 @@ def test_growth_that_is_not_to_blame_for_other_loops_stays(evidence_above):
     assert joint.loops() == 2 and joint.height() == pytest.approx(0.2, abs=1.5 * LATTICE.spacing)
 
 
-def test_openings_that_have_met_are_parted(evidence_above):
-    """Of two openings one grows, and later a strip between them goes, and more."""
-    evidence_above["later"] = 0.5
+def met_openings(gone_below: bool) -> tuple[StillJoint, SecondLook]:
+    """Of two openings one grows, and later a strip between them goes, and more; before the end a third one,
+    at the other end, may go."""
     joint, (x, _, z) = StillJoint(CONFIG), LATTICE.vertex_positions().T
     joint.cut(0.8 * x - 0.6 * z > 0.45)
+    if gone_below:
+        joint.cut(z < -0.5)
     worker = run(joint, range(7))
-    assert joint.loops() == 2
+    assert joint.loops() == 2 + gone_below
+    if gone_below:
+        closed = np.where(z < -0.35, 0.05, joint.subject.msdf.numpy()).astype(np.float32)
+        joint.geometry.replace("msdf", mi.Float(closed))
     joint.cut((x > 0.1) & (z > -0.25))
     joint.apply(geometry=True)
     assert joint.loops() == 1
+    return joint, worker
+
+
+def test_openings_that_have_met_are_parted(evidence_above):
+    evidence_above["later"] = 0.5
+    joint, worker = met_openings(gone_below=False)
     assert worker.finish() is True
     assert joint.loops() == 2
     above, all_above = (((z > 0.25) & (z < 0.45)).sum() for z in (
         mesh.to_numpy()[0][:, 2] for mesh in (joint.subject.surface, joint.subject.template())))
     assert above < 0.9 * all_above, "not all that had opened comes back"
+
+
+def test_openings_are_parted_alike_where_loops_elsewhere_have_gone(evidence_above):
+    evidence_above["later"] = 0.5
+    parted = []
+    for gone_below in (False, True):
+        joint, worker = met_openings(gone_below)
+        assert worker.finish() is True
+        assert joint.loops() == 2
+        vertices = joint.subject.surface.to_numpy()[0]
+        parted.append(vertices[vertices[:, 2] > -0.2])
+    np.testing.assert_allclose(*parted, atol=1e-4)
 
 
 @pytest.mark.parametrize("later", [0.5, 1.1])
