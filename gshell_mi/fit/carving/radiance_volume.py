@@ -22,6 +22,7 @@ from ..bookkeeping.observer import Preview
 from ..config import FitConfig
 from ..ghost.contrast import Contrast
 from ..ghost.pixels import PixelPool
+from ..lanes import chosen_lanes
 
 #: Length of a step along a ray, in cells.
 _STEP = 0.5
@@ -169,15 +170,12 @@ class RadianceVolume:
         sample = self.pixels.sample(self.config.carving_batch, seed=self.config.seed, step=step)
         ray = self.views.rays(sample.view, sample.film)
         hit = self.scene.ray_intersect_preliminary(ray, coherent=False)
-        found = hit.is_valid()
-        dr.eval(ray.o, ray.d, hit.t, found)  # in one kernel: what is gathered from is evaluated one by one
-        index = dr.compress(found)
+        values = ray.o, ray.d, hit.t, sample.radiance, sample.alpha
+        index = chosen_lanes(hit.is_valid(), values)
         if not dr.width(index):
             index = mi.UInt32(0)  # a ray without steps: arrays are never empty
         # The others have nothing to march through.
-        origin, direction, t, target, alpha = (
-            dr.gather(type(value), value, index)
-            for value in (ray.o, ray.d, hit.t, sample.radiance, sample.alpha))
+        origin, direction, t, target, alpha = (dr.gather(type(value), value, index) for value in values)
         origin, direction = self.to_lattice @ origin, self.to_lattice @ direction
         length = dr.norm(direction)
         direction = mi.Vector3f(direction / length)

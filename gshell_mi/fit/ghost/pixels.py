@@ -15,8 +15,8 @@ from ...views import PinholeViews
 #: Coverage of a pixel from which on nothing of the background is in it.
 COVERED = 0.99
 
-#: Less coverage is taken for noise.
-_FAINT = 0.01
+#: Coverage of a pixel below which it shows the background: the rest is noise.
+FAINT = 0.01
 
 #: Pixels this near to a mask are drawn, too: a template that is still to move may reach beyond it.
 _MARGIN = 3
@@ -99,7 +99,7 @@ class PixelPool:
 
 def _near_object(target: Target) -> np.ndarray:
     """(height, width) whether a ray through a pixel may meet the visual hull, which bridges holes."""
-    mask = ndimage.binary_fill_holes(target.rgba[..., 3] > _FAINT)
+    mask = ndimage.binary_fill_holes(target.rgba[..., 3] > FAINT)
     near = ndimage.maximum_filter(mask, 2 * _MARGIN + 1)
     return near if near.any() else np.ones_like(near)
 

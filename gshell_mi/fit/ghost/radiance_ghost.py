@@ -27,7 +27,7 @@ from ..config import FitConfig
 from .contrast import Contrast
 from .glossy_lobe import PER_SIDE, SHARED, initial_lobe, mirrored_radiance
 from .mesh_normals import vertex_normals
-from .pixels import COVERED, PixelPool, PixelSample
+from .pixels import COVERED, FAINT, PixelPool, PixelSample
 from .sheets import Sheet, trace_sheets
 
 #: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
@@ -98,7 +98,7 @@ class RadianceGhost:
         image = share * losses.l1(self._tone(radiance), self._tone(sample.radiance))
         mask = share * losses.mask_l2(alpha, sample.alpha)
         # Where a mask shows daylight within the hull, every sheet on the ray is open: no doubt, no balance.
-        daylight = share * losses.mask_l2(dr.select(sample.alpha < 0.01, alpha, 0), 0)
+        daylight = share * losses.mask_l2(dr.select(sample.alpha < FAINT, alpha, 0), 0)
         opacity = sigmoid(optimizer["opacity"])
         front, back = (softplus(side) for side in self._sides())
         # Undecided opacity must have its say first; only then is it made to decide.

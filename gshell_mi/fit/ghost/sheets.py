@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..lanes import chosen_lanes
+
 
 @dataclass
 class Sheet:
@@ -58,12 +60,11 @@ def trace_sheets(scene: mi.Scene, positions: mi.Float, faces: mi.Vector3u, ray: 
     origin, direction, active = ray.o, ray.d, mi.Bool(True)
     for _ in range(count):
         hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
-        found, ray = hit.is_valid(), (origin, direction, hit.t, hit.prim_uv, hit.prim_index)
-        dr.eval(found, ray)  # in one kernel: what is gathered from is evaluated one by one
-        lane = dr.compress(found)
+        values = origin, direction, hit.t, hit.prim_uv, hit.prim_index
+        lane = chosen_lanes(hit.is_valid(), values)
         if not dr.width(lane):
             break
-        origin, direction, t, uv, prim = (dr.gather(type(value), value, lane) for value in ray)
+        origin, direction, t, uv, prim = (dr.gather(type(value), value, lane) for value in values)
         face = dr.gather(mi.Vector3u, faces, prim)
         a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in face)
         front = dr.dot(dr.cross(b - a, c - a), direction) < 0

@@ -124,12 +124,13 @@ class SecondLook:
             self.joint.finish()
             tried.append((self._loops_off(kept), self._msdf()))
         off, msdf = min(tried, key=lambda attempt: attempt[0])
-        if off:
-            self.joint.geometry.replace("msdf", tried[0][1])
-            self._undo(kept)
-            self.joint.finish()
-            if self._loops_off(np.zeros_like(kept)) < off:
-                return False
+        if not off:
+            return True
+        self.joint.geometry.replace("msdf", tried[0][1])
+        self._undo(kept)
+        self.joint.finish()
+        if self._loops_off(np.zeros_like(kept)) < off:
+            return False
         self.joint.geometry.replace("msdf", msdf)
         self.joint.finish()
         return True

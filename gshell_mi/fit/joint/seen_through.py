@@ -17,6 +17,7 @@ from ...compat import mesh_scene
 from ...extraction.surface_mesh import SurfaceMesh
 from ...views import PinholeViews
 from ..ghost.pixels import COVERED, PixelPool
+from ..lanes import chosen_lanes
 
 #: Pixels per batch, and batches.
 _BATCH, _BATCHES = 65536, 24
@@ -75,10 +76,8 @@ def explained(template: SurfaceMesh, scene: mi.Scene, integrator, views: Pinhole
             sample = pixels.sample(_BATCH, seed=seed, step=batch)
             ray = views.rays(sample.view, sample.film)
             hit = shell.ray_intersect_preliminary(ray, coherent=False)
-            counts = hit.is_valid() & (sample.alpha > COVERED)
             met = ray.o, ray.d, hit.t, hit.prim_index, hit.prim_uv, sample.radiance
-            dr.eval(counts, met)  # in one kernel: what is gathered from is evaluated one by one
-            index = dr.compress(counts)
+            index = chosen_lanes(hit.is_valid() & (sample.alpha > COVERED), met)
             if dr.width(index) == 0:
                 continue
             origin, direction, distance, prim, uv, target = (dr.gather(type(value), value, index)
