@@ -51,6 +51,8 @@ class ExplicitGrid(Parametrisation):
     def carry(self, carried: Carried) -> None:
         for optimizer in self.optimizers.values():
             carried.optimizer(optimizer, tuple(optimizer.keys()))
+        if self.held is not None:
+            self.held = carried.moments(self.held)
         self.lattice = carried.after
 
     def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
@@ -64,11 +66,17 @@ class ExplicitGrid(Parametrisation):
                  "weights": local}
         steps = {name: trusted(gradient) for name, gradient in gradients.items()}
         steps |= diffuse.together({name: steps[name] for name in steps if name in CHANNELS}, smoothing)
+        before = self.fields()
+        if self.held is not None:
+            # No momentum gathers meanwhile.
+            steps["msdf"] = dr.select(self.held, 0, steps["msdf"])
         for name, gradient in steps.items():
             dr.set_grad(self._optimizer_of(name)[name], gradient)
         for optimizer in self.optimizers.values():
             optimizer.set_learning_rate({name: decay * rates[name] for name in optimizer.keys()})
             optimizer.step()
+        if self.held is not None:
+            self.msdf_optimizer["msdf"] = dr.select(self.held, before["msdf"], self.msdf_optimizer["msdf"])
         if "deform" in gradients:
             self.optimizer["deform"] = dr.clip(self.optimizer["deform"], -1, 1)
 

@@ -48,6 +48,9 @@ class Parametrisation(ABC):
     fitting_steps: int = 0
     """Calls of ``fit_step`` that bring the fields to what they are to start from; 0 if they start there."""
 
+    held: mi.Bool | None = None
+    """Lattice vertices where the mSDF stays as it is; None for none. Heeded where ``replace`` is."""
+
     @property
     @abstractmethod
     def optimizers(self) -> dict[str, mi.ad.Adam]:

@@ -6,7 +6,9 @@ in as well as the one that it fits to the dark inside. A path tracer knows how d
 what would be seen without the surface beside an opening. Where that is about as good without anything having
 been fitted to it, the opening grows. And a small opening through which nothing looks like the images, such as
 one found in a bulge of the hull, is shut. After further steps each place is judged: it stays as it is
-now if the images are explained better. A loose part that has come back so, and is a sheet, opens on one side.
+now if the images are explained better. Until then the mSDF rests where an opening has grown, as a cap whose
+colours were fitted for long would win against an inside to which nothing has been yet. A loose
+part that has come back so, and is a sheet, opens on one side.
 """
 
 from __future__ import annotations
@@ -86,6 +88,8 @@ class SecondLook:
         if config.field != "explicit" or config.watertight or self._judges >= count:
             self._changes = count     # never
         self._state = {name: array for name, array in state.items() if name.startswith(_PREFIX)}
+        if (held := self._state.pop(f"{_PREFIX}held", None)) is not None:
+            joint.geometry.held = mi.Bool(held)
 
     def step(self, iteration: int) -> Mapping[str, float]:
         """One step of the joint stage, after what is to be done before it."""
@@ -101,7 +105,8 @@ class SecondLook:
 
     def state(self) -> dict[str, np.ndarray]:
         """What a checkpoint keeps, so that a fit that goes on judges alike."""
-        return dict(self._state)
+        held = self.joint.geometry.held
+        return self._state | ({} if held is None else {f"{_PREFIX}held": held.numpy()})
 
     def finish(self) -> bool | None:
         """Ends the joint stage; returns whether openings have changed for good, None if none was doubted.
@@ -150,7 +155,9 @@ class SecondLook:
         if not (grows | shut).any():
             return
         changed, near = reopened(values, (before | grows) & ~shut, smooth, self._scale)
-        self._write(template, changed, near)
+        former = self._msdf()
+        msdf = self._write(template, changed, near)
+        self.joint.geometry.held = (msdf < 0) & (msdf != former)
         patch = np.full(len(vertices), -1)
         place = equal_patches(np.where(grows, 1, np.where(shut, 2, 0)), faces)
         patch[grows | shut] = np.unique(place[grows | shut], return_inverse=True)[1]
@@ -170,6 +177,7 @@ class SecondLook:
         # All of the surface has been explained better since.
         ratio = now[:-1] / then[:-1] * (then[-1] / now[-1])
         unjustified = ratio >= self.joint.config.second_look_gain
+        self.joint.geometry.held = None
         self._undo(unjustified)
         self._state[f"{_PREFIX}kept"] = ~unjustified
         self._open_sheets(~unjustified)
@@ -274,11 +282,11 @@ class SecondLook:
         return explained(template, self.joint.scene, self.joint.integrator, self._views, self._pixels,
                          self.joint.seed(iteration), behind=behind)
 
-    def _write(self, template: SurfaceMesh, values: np.ndarray, changed: np.ndarray) -> None:
+    def _write(self, template: SurfaceMesh, values: np.ndarray, changed: np.ndarray) -> mi.Float:
         """Gives the mSDF new values (V,) at those vertices of the template that have changed (V,)."""
-        subject = self.joint.subject
-        self.joint.geometry.replace("msdf", rewritten(dr.detach(subject.msdf), values, changed, template,
-                                                      subject.lattice))
+        msdf = rewritten(self._msdf(), values, changed, template, self.joint.subject.lattice)
+        self.joint.geometry.replace("msdf", msdf)
+        return msdf
 
 
 def doubtful(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found: Explained) -> np.ndarray:

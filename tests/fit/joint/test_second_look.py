@@ -199,7 +199,7 @@ class StillJoint:
         fields = sphere(LATTICE, RADIUS)
         self.subject.set_fields(replace(fields, msdf=(0.45 - fields.lattice.vertex_positions()[:, 2])
                                         .astype(np.float32)))
-        self.geometry = SimpleNamespace(replace=self._replace)
+        self.geometry = SimpleNamespace(replace=self._replace, held=None)
         self.scene = self.integrator = None
 
     def _replace(self, name, field):
@@ -268,6 +268,25 @@ def test_growth_stays_if_the_images_are_explained_better(evidence_above, later, 
     assert worker.finish() is (height < 0.4)
     assert joint.height() == pytest.approx(height, abs=1.5 * LATTICE.spacing)
     assert joint.loops() == 1
+
+
+def test_what_has_grown_rests_until_it_is_judged(evidence_above):
+    """At the lattice's vertices from the new rim to the old one; a fit that goes on knows of it."""
+    evidence_above["later"] = 0.5
+    joint = StillJoint(CONFIG)
+    worker = run(joint, range(1))
+    held, msdf = joint.geometry.held.numpy(), joint.subject.msdf.numpy()
+    opened = (msdf < 0) & (LATTICE.vertex_positions()[:, 2] < 0.45)
+    near = np.abs(joint.subject.fields().sdf) < 0.5 * LATTICE.spacing
+    assert held[opened & near].all() and (opened & near).sum() > 50
+    assert (msdf[held] < 0).all()
+
+    joint.geometry.held, state = None, worker.state()
+    worker = run(joint, range(1, 4), state)
+    np.testing.assert_array_equal(joint.geometry.held.numpy(), held)
+    np.testing.assert_array_equal(worker.state()["second_look/held"], held)
+    worker = run(joint, range(4, 5), worker.state())
+    assert joint.geometry.held is None and "second_look/held" not in worker.state()
 
 
 def test_specks_grow_with_the_opening_that_they_belong_to(evidence_above):
