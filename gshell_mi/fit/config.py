@@ -175,7 +175,7 @@ class FitConfig:
     """Fraction of the steps after which openings grow where what is behind the surface beside them explains
     the images about as well, and small ones are shut that explain them badly; 1 leaves it out. Only if
     --field is explicit."""
-    second_look_gain: float = 1.5
+    second_look_gain: float = 2.0
     """Such a change stays if, after half of the remaining steps, the squared image error there is below this
     multiple of what it was, times what the rest of the surface has gained meanwhile. Above 1, as colours were
     fitted to a cap for longer than anything was to what is behind it."""

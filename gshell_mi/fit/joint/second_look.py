@@ -6,9 +6,9 @@ in as well as the one that it fits to the dark inside. A path tracer knows how d
 what would be seen without the surface beside an opening. Where that is about as good without anything having
 been fitted to it, the opening grows. And a small opening through which nothing looks like the images, such as
 one found in a bulge of the hull, is shut. After further steps each place is judged: it stays as it is
-now if the images are explained better. Until then the mSDF rests where an opening has grown, as a cap whose
-colours were fitted for long would win against an inside to which nothing has been yet. A loose
-part that has come back so, and is a sheet, opens on one side.
+now if the images are explained better. Until then the mSDF rests inside of what has opened, as a cap whose
+colours were fitted for long would win against what nothing has been fitted to yet. A loose part that has come
+back so, and is a sheet, opens on one side.
 """
 
 from __future__ import annotations
@@ -52,6 +52,9 @@ _ENOUGH = 100
 
 #: Size, in cells, of the new mSDF.
 _SURE = 0.5
+
+#: Where the new mSDF is below minus this share of its size it rests: not at the rim, which is uncertain.
+_CORE = 0.25
 
 #: Longest way, in cells, between an opening and what opens apart from it.
 _WAY = 14.0
@@ -157,7 +160,7 @@ class SecondLook:
         changed, near = reopened(values, (before | grows) & ~shut, smooth, self._scale)
         former = self._msdf()
         msdf = self._write(template, changed, near)
-        self.joint.geometry.held = (msdf < 0) & (msdf != former)
+        self.joint.geometry.held = (msdf < -_CORE * self._scale) & (msdf != former)
         patch = np.full(len(vertices), -1)
         place = equal_patches(np.where(grows, 1, np.where(shut, 2, 0)), faces)
         patch[grows | shut] = np.unique(place[grows | shut], return_inverse=True)[1]
