@@ -349,7 +349,7 @@ class _Fit:
 
     def _joint_stage(self, name: str, lattice: Lattice, config: FitConfig) -> JointStage:
         start = dict(self.checkpoint.arrays)
-        fields = start_fields(start, lattice, config)
+        fields = start_fields(self.scene.subject, start, lattice, config)
         self.scene.subject.set_fields(fields)
         joint = JointStage(self.scene, start_material(self.scene, start, fields.lattice, config),
                            start_light(self.scene, start, config), config)

@@ -15,6 +15,7 @@ from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, given_material
 from ..scene import FitScene
 from .config import FitConfig
+from .cut.recut import recut
 
 #: Median reflectance that the first split of radiance into material and light assumes.
 TYPICAL_REFLECTANCE = 0.5
@@ -55,16 +56,20 @@ def check_given(scene: FitScene, config: FitConfig) -> None:
                         f"metallic.")
 
 
-def start_fields(arrays: Mapping[str, np.ndarray], lattice: Lattice, config: FitConfig) -> LatticeFields:
-    """The fields that earlier stages left, or a checkpoint of the joint stage in blocks, on ``lattice``."""
+def start_fields(subject: mi.Shape, arrays: Mapping[str, np.ndarray], lattice: Lattice,
+                 config: FitConfig) -> LatticeFields:
+    """The fields that earlier stages left, or a checkpoint of the joint stage in blocks, on ``lattice``; the
+    shape is left with any."""
     if f"{_BAND}blocks" in arrays:
         stored = {name: arrays[f"{_BAND}{name}"] for name in ("sdf", "msdf", "deform", "blocks")}
         return LatticeFields(**stored, grid=lattice.grid, block_resolution=lattice.resolution)
     deform = arrays.get("deform", np.zeros(3 * arrays["sdf"].size, np.float32))
     fields = LatticeFields(arrays["sdf"], arrays["msdf"], deform, grid=lattice.grid)
-    if lattice.resolution >= config.band_resolution and lattice.fits_in_blocks:
-        return fields.in_blocks(lattice.resolution)
-    return fields if fields.lattice == lattice else fields.to_lattice(lattice.resolution)
+    in_blocks = lattice.resolution >= config.band_resolution and lattice.fits_in_blocks
+    if fields.lattice == lattice:
+        return fields.in_blocks() if in_blocks else fields
+    resample = fields.in_blocks if in_blocks else fields.to_lattice
+    return recut(subject, fields, resample(lattice.resolution))
 
 
 def block_arrays(fields: LatticeFields) -> dict[str, np.ndarray]:

@@ -39,7 +39,7 @@ def test_it_starts_with_what_the_joint_stage_has_left(bowl_scene, resolution):
     left = joint.outcome() | {"light": np.float32(1)}
 
     finer = FlexiCubesLattice(resolution)
-    start = start_fields(left, finer, CONFIG)
+    start = start_fields(fit.subject, left, finer, CONFIG)
     assert (start.blocks is None) == (resolution < CONFIG.band_resolution)
     fit.subject.set_fields(start)
     vertices = fit.subject.surface.to_numpy()[0]

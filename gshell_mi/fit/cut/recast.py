@@ -17,9 +17,10 @@ from ...conversion.solid_distance import solid_distance
 from ...fields import LatticeFields
 from ...fields.smoothing import MeshDiffusion
 from ...topology import PINHOLE, Topology, boundary_edges, topology
-from ...triangles import area_vectors, positive_part
+from ...triangles import positive_part
 from ..ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
-from .template_sides import cast, normals_at_vertices, opposite_sides
+from .template_sides import normals_at_vertices, opposite_sides
+from .values_nearby import values_nearby
 
 #: The lattice holds what is this thick, in cells, whatever its direction ...
 _THICKNESS = 1.2
@@ -32,9 +33,6 @@ _SOLID_THICKNESS = 0.9
 
 #: Values come from where the ray along the normal meets the moved template, at most this many cells away.
 _REACH = 1.5
-
-#: Nearest vertices among which one that faces the same way is looked for.
-_NEIGHBOURS = 8
 
 #: Logits of thin parts are limited to this.
 _CERTAIN = 1.0
@@ -114,8 +112,8 @@ def _fields(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: n
     new_vertices, new_faces, _ = template.to_numpy()
     placed = new_vertices @ to_lattice[:3, :3].T + to_lattice[:3, 3]
     placed_faces = new_faces if local_faces is faces else new_faces[:, ::-1]
-    values = _values_on(local, local_faces, np.column_stack([logits, radiance]), placed, placed_faces,
-                        _REACH * lattice.spacing)
+    values = values_nearby(local, local_faces, np.column_stack([logits, radiance]), placed, placed_faces,
+                           _REACH * lattice.spacing)
     # A very sure side must not outvote the other one at the lattice's vertices between them.
     limited = np.clip(values[:, 0], -_CERTAIN, _CERTAIN)
     msdf = msdf_from_template(clean_opacity(limited, new_vertices, new_faces, min_area), template, lattice)
@@ -169,27 +167,3 @@ def thickened(before: np.ndarray, moved: np.ndarray, faces: np.ndarray, solid: n
         growth[solid & ~other] = 0
         moved = moved + growth[:, None] * normals
     return moved
-
-
-def _values_on(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray, points: np.ndarray,
-               point_faces: np.ndarray, reach: float) -> np.ndarray:
-    """(n, k) values at the vertices ``points`` of a mesh near another one, from (V, k) at that one's.
-
-    The nearest hit along the normal counts that faces the same way, which is no hit on the other side of a
-    thin part; points that have none take the value of the nearest vertex that does, or else of the nearest.
-    """
-    normals, facing = normals_at_vertices(points, point_faces), normals_at_vertices(vertices, faces)
-    near = cKDTree(vertices).query(points, k=_NEIGHBOURS)[1]
-    same = np.einsum("nkj,nj->nk", facing[near], normals) > 0
-    result = values[near[np.arange(len(points)), same.argmax(axis=1)]]
-    best = np.full(len(points), np.inf)
-    face_normals = area_vectors(vertices, faces)
-    # A ray that starts on the mesh would miss it.
-    behind = 0.05 * reach
-    for direction in (normals, -normals):
-        face, weights, distance = cast(vertices, faces, points - behind * direction, direction, reach)
-        distance = np.abs(distance - behind)
-        closer = (distance < best) & (np.einsum("nj,nj->n", face_normals[face], normals) > 0)
-        best[closer] = distance[closer]
-        result[closer] = np.einsum("ni,nik->nk", weights[closer], values[faces[face[closer]]])
-    return result
