@@ -341,13 +341,14 @@ class _Fit:
     def _joint(self) -> JointStage:
         """The joint stage on the lattice that the fit ends on; on a coarser one first, if there is one."""
         if self.joint_lattice == self.last_lattice:
-            return self._joint_stage("joint", self.last_lattice, self.config)
+            return self._joint_stage("joint", self.last_lattice, self.config).joint
         if self.checkpoint.stage in ("field", "joint"):
             coarse = self._joint_stage("joint", self.joint_lattice, self.config)
-            self.books.enter("detail", **coarse.outcome(), light=self.checkpoint.arrays["light"])
-        return self._joint_stage("detail", self.last_lattice, self.config.for_detail())
+            self.books.enter("detail", **coarse.joint.outcome(), **coarse.state(),
+                             light=self.checkpoint.arrays["light"])
+        return self._joint_stage("detail", self.last_lattice, self.config.for_detail()).joint
 
-    def _joint_stage(self, name: str, lattice: Lattice, config: FitConfig) -> JointStage:
+    def _joint_stage(self, name: str, lattice: Lattice, config: FitConfig) -> SecondLook:
         start = dict(self.checkpoint.arrays)
         fields = start_fields(self.scene.subject, start, lattice, config)
         self.scene.subject.set_fields(fields)
@@ -366,7 +367,7 @@ class _Fit:
             self.checkpoint.facts["openings_changed"] = changed
         if self.checkpoint.stage == name and lattice == self.last_lattice:
             self.books.leave()
-        return joint
+        return look
 
     def _write_metrics(self, metrics: dict) -> dict:
         mib = {"estimated_memory_mib": self.memory.total, "peak_memory_mib": peak_memory()}

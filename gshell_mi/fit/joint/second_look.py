@@ -78,7 +78,8 @@ class SecondLook:
     Args:
         joint: does the steps; its fields are explicit.
         views, pixels: the targets.
-        state: what ``state`` gave, where the stage goes on.
+        state: what ``state`` gave where the stage goes on, or at the end of that on a coarser lattice, whose
+            openings are looked after then.
     """
 
     def __init__(self, joint: JointStage, views: PinholeViews, pixels: PixelPool,
@@ -137,7 +138,9 @@ class SecondLook:
         self.joint.geometry.replace("msdf", tried[0][1])
         self._undo(kept)
         self.joint.finish()
-        if self._loops_off(np.zeros_like(kept)) < off:
+        none = np.zeros_like(kept)
+        if self._loops_off(none) < off:
+            self._state[f"{_PREFIX}kept"] = none
             return False
         self.joint.geometry.replace("msdf", msdf)
         self.joint.finish()
@@ -171,7 +174,8 @@ class SecondLook:
                  for index in range(patch.max() + 1)]
         self._state = {f"{_PREFIX}points": vertices, f"{_PREFIX}values": values, f"{_PREFIX}patch": patch,
                        f"{_PREFIX}errors": _errors(found, patch, ~before),
-                       f"{_PREFIX}loops": np.array(loops), f"{_PREFIX}spent": np.array(spent)}
+                       f"{_PREFIX}loops": np.array(loops), f"{_PREFIX}spent": np.array(spent),
+                       f"{_PREFIX}cell": np.float64(self.joint.subject.cell_size)}
 
     def _judge(self, iteration: int) -> None:
         template, vertices, _, values = self._template()
@@ -253,7 +257,7 @@ class SecondLook:
         """Of vertices (V, 3) of the present template the nearest ones of that which was changed, and their
         patches, -1 for none."""
         distance, nearest = cKDTree(self._state[f"{_PREFIX}points"]).query(vertices)
-        near = distance < _NEAR * self.joint.subject.cell_size
+        near = distance < _NEAR * self._cell
         return nearest, np.where(near, self._state[f"{_PREFIX}patch"][nearest], -1)
 
     def _openings(self, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -267,7 +271,12 @@ class SecondLook:
     @property
     def _reach(self) -> float:
         """Longest way to what opens apart, in world units."""
-        return _WAY * self.joint.subject.cell_size
+        return _WAY * self._cell
+
+    @property
+    def _cell(self) -> float:
+        """Size of a cell of the lattice on which openings have changed, or shall."""
+        return float(self._state.get(f"{_PREFIX}cell", self.joint.subject.cell_size))
 
     @property
     def _scale(self) -> float:

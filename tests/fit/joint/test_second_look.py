@@ -362,6 +362,19 @@ def test_openings_are_parted_alike_where_loops_elsewhere_have_gone(evidence_abov
     np.testing.assert_allclose(*parted, atol=1e-4)
 
 
+def test_what_comes_apart_on_a_finer_lattice_is_joined(evidence_above):
+    """All that has grown closes there, but for a place a cell away from the opening."""
+    evidence_above["later"] = 0.5
+    worker = run(StillJoint(CONFIG), range(8))
+    assert worker.finish() is True
+    joint, (x, _, z) = StillJoint(replace(CONFIG, second_look=1.0)), LATTICE.vertex_positions().T
+    joint.cut((x > 0.2) & (z > 0.25) & (z < 0.35))
+    joint.apply(geometry=True)
+    assert joint.loops() == 2
+    assert run(joint, range(8), worker.state()).finish() is True
+    assert joint.loops() == 1
+
+
 @pytest.mark.parametrize("later", [0.5, 1.1])
 def test_a_doubtful_opening_stays_shut_if_the_images_are_explained_better(evidence_above, later):
     """The opening at the side is small, and nothing looks like the images through it."""
