@@ -7,8 +7,9 @@ what would be seen without the surface beside an opening. Where that is about as
 been fitted to it, the opening grows. And a small opening through which nothing looks like the images, such as
 one found in a bulge of the hull, is shut. After further steps each place is judged: it stays as it is
 now if the images are explained better. Until then the mSDF rests inside of what has opened, as a cap whose
-colours were fitted for long would win against what nothing has been fitted to yet. A loose part that has come
-back so, and is a sheet, opens on one side.
+colours were fitted for long would win against what nothing has been fitted to yet. Loose parts
+that are small sheets, such as islands of lace, are solid on one side only, whether they have come back so or
+the template had both.
 """
 
 from __future__ import annotations
@@ -153,16 +154,19 @@ class SecondLook:
         before = values <= 0
         if before.all() or not before.any():
             return
+        side = self._sheet_sides(template, vertices, faces, before)
+        values, before = np.where(side, -self._scale, values), before | side
         found = self._explained(template, iteration)
         smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
         shut = doubtful(values, vertices, faces, found)
         grows = near_openings(np.where(shut, self._scale, values), vertices, faces, found, smooth,
                               self._reach) & ~before
         if not (grows | shut).any():
+            self._write(template, values, side)
             return
         changed, near = reopened(values, (before | grows) & ~shut, smooth, self._scale)
         former = self._msdf()
-        msdf = self._write(template, changed, near)
+        msdf = self._write(template, changed, near | side)
         self.joint.geometry.held = (msdf < -_CORE * self._scale) & (msdf != former)
         patch = np.full(len(vertices), -1)
         place = equal_patches(np.where(grows, 1, np.where(shut, 2, 0)), faces)
@@ -197,15 +201,22 @@ class SecondLook:
         back = (patch >= 0) & kept[patch] & (self._state[f"{_PREFIX}values"][nearest] <= 0)
         part = mesh_components(faces, len(vertices))
         elsewhere = 2 * np.bincount(part, back) < np.bincount(part)
-        others = elsewhere[part] | self._openings(vertices, faces, values)
-        side, _ = small_sheets(vertices, template.vertex_normals().numpy().T, faces, others,
-                               _SHEET * self.joint.subject.cell_size)
+        side = self._sheet_sides(template, vertices, faces,
+                                 elsewhere[part] | self._openings(vertices, faces, values))
         self._write(template, np.where(side, -self._scale, values), side)
         for sheet in np.unique(part[side]):
             owner = np.bincount(patch[back & (part == sheet)]).argmax()
             self._state[f"{_PREFIX}spent"][owner] -= (1, 0)
         # From here on these are openings like those from before.
         self._state[f"{_PREFIX}patch"][nearest[side]] = -1
+
+    def _sheet_sides(self, template: SurfaceMesh, vertices: np.ndarray, faces: np.ndarray,
+                     others: np.ndarray) -> np.ndarray:
+        """(V,) one side of each small loose part that is a sheet and has none of the others (V,)."""
+        part, areas = mesh_components(faces, len(vertices)), vertex_areas(vertices, faces)
+        large = np.bincount(part, areas) > _SMALL * areas.sum()
+        return small_sheets(vertices, template.vertex_normals().numpy().T, faces, others | large[part],
+                            _SHEET * self.joint.subject.cell_size)[0]
 
     def _undo(self, chosen: np.ndarray) -> None:
         """Gives those patches that are chosen (P,) what they had before."""

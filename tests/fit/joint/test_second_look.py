@@ -390,27 +390,44 @@ def test_a_doubtful_opening_stays_shut_if_the_images_are_explained_better(eviden
     assert joint.loops() == (1 if later < 1 else 2)
 
 
+def ball_and_disc(thickness: float, msdf: float) -> StillJoint:
+    """An open ball, and beside it a loose part, a disc or a drum so many cells thick, with that mSDF."""
+    joint, (x, y, z) = StillJoint(CONFIG), LATTICE.vertex_positions().T
+    disc = np.maximum(np.hypot(y, z) - 4.5 * LATTICE.spacing,
+                      np.abs(x - 0.65) - thickness / 2 * LATTICE.spacing)
+    ball = np.linalg.norm([x + 0.35, y, z], axis=0) - RADIUS
+    joint.subject.set_fields(replace(joint.subject.fields(), sdf=np.minimum(disc, ball).astype(np.float32),
+                                     msdf=np.where(x > 0.3, msdf, 0.45 - z).astype(np.float32)))
+    return joint
+
+
 @pytest.mark.parametrize(("thickness", "later", "components", "loops"),
                          [(1.2, 0.5, 2, 2), (4.0, 0.5, 2, 1), (1.2, 1.1, 1, 1)])
 def test_a_sheet_that_comes_back_has_one_side(evidence_above, monkeypatch, thickness, later, components,
                                               loops):
-    """Beside the ball is a loose part, a disc or a drum, that has been cut away."""
+    """The disc has been cut away."""
     monkeypatch.setattr(second_look, "_SMALL", 0.8)     # as a lattice this coarse needs
     evidence_above |= {"later": later, "doubtful": 20.0, "empty": 0.1}
-    joint, (x, y, z) = StillJoint(CONFIG), LATTICE.vertex_positions().T
-    distance = np.maximum(np.hypot(y, z) - 4.5 * LATTICE.spacing,
-                          np.abs(x - 0.65) - thickness / 2 * LATTICE.spacing)
-    fields = joint.subject.fields()
-    ball = np.linalg.norm([x + 0.35, y, z], axis=0) - RADIUS
-    msdf = np.where(x > 0.3, -0.05, 0.45 - z)
-    joint.subject.set_fields(replace(fields, sdf=np.minimum(distance, ball).astype(np.float32),
-                                     msdf=msdf.astype(np.float32)))
+    joint = ball_and_disc(thickness, -0.05)
     assert joint.loops() == 1
     worker = run(joint, range(7))
     worker = run(joint, range(7, 8), worker.state())
     assert worker.finish() is (later < 1)
     found = topology(*joint.subject.surface.to_numpy()[:2])
     assert (found.components, found.boundary_loops, found.pinholes) == (components, loops, 0)
+
+
+@pytest.mark.parametrize(("thickness", "loops", "grows"), [(1.2, 2, False), (1.2, 2, True), (4.0, 1, False)])
+def test_a_loose_sheet_has_one_side(evidence_above, monkeypatch, thickness, loops, grows):
+    """The disc has both. Whether there is anything else to change is of no account."""
+    monkeypatch.setattr(second_look, "_SMALL", 0.8)
+    evidence_above |= {"later": 0.5, "empty": 0.4 if grows else 0.1}
+    joint = ball_and_disc(thickness, 0.05)
+    assert joint.loops() == 1
+    assert run(joint, range(8)).finish() is (True if grows else None)
+    assert joint.loops() == loops
+    assert (joint.height() < 0.3) == grows
+    assert joint.geometry.held is None
 
 
 @pytest.mark.parametrize("settings", [{"second_look": 1.0}, {"watertight": True}, {"field": "hashgrid"},
