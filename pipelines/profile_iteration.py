@@ -38,7 +38,7 @@ def joint_stage(scene: Path, output: Path):
     known = FitConfig.__dataclass_fields__
     config = FitConfig(**{name: value for name, value in checkpoint.config.items() if name in known})
     arrays = checkpoint.arrays
-    fields = start_fields(arrays, fit_lattice(fit.subject, config), config)
+    fields = start_fields(fit.subject, arrays, fit_lattice(fit.subject, config), config)
     fit.subject.set_fields(fields)
     material = start_material(fit, arrays, fields.lattice, config)
     joint = JointStage(fit, material, start_light(fit, arrays, config), config)

@@ -366,7 +366,7 @@ def test_band_gives_the_same_mesh_and_follows():
     whole, stored = (_subject(scene) for scene in scenes)
     assert stored.lattice.vertex_count < 0.6 * whole.lattice.vertex_count
     for a, b in zip(whole.surface.to_numpy(), stored.surface.to_numpy(), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-6)  # the sphere's values are not computed alike
+        np.testing.assert_allclose(a, b, atol=2e-6)  # the sphere's values are not computed alike
     params = mi.traverse(scenes[1])
     stored.attach_attribute("vertex_color", stored.lattice.points(mi.Float).x)
     assert stored.follow() is None and whole.follow() is None

@@ -162,8 +162,9 @@ class GridExtraction(ABC):
         if dr.grad_enabled(x0, x1):
             m0 = dr.replace_grad(m0, dr.select(x0 < 0, -x0, x0))
             m1 = dr.replace_grad(m1, dr.select(x1 < 0, -x1, x1))
-        # Halved, as the sum of two finite numbers may overflow.
-        return 0.5 * m0 / (0.5 * m0 + 0.5 * m1)
+        # Made smaller, as the sum of two finite numbers may overflow, and GPUs take a quotient by more than
+        # 2^126 for 0.
+        return 0.125 * m0 / (0.125 * m0 + 0.125 * m1)
 
     def kept_and_dropped(self, points: Any, msdf: Any) -> tuple[Any, Any]:
         """Indices of the points where the mSDF is not negative, and of the others."""

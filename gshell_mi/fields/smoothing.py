@@ -168,8 +168,9 @@ class MeshDiffusion:
         adjacency = coo_matrix((np.ones(len(start)), (start, end)), shape=(vertex_count, vertex_count))
         system = (eye(vertex_count) + smoothing * laplacian(adjacency + adjacency.T)).tocoo()
         self._count = vertex_count
-        self._solver = CholeskySolverF(vertex_count, system.row.astype(np.int32), system.col.astype(np.int32),
-                                       system.data.astype(np.float64), MatrixType.COO)
+        # Dr.Jit's arrays tell where to solve: on the CPU or the GPU.
+        self._solver = CholeskySolverF(vertex_count, mi.Int32(system.row), mi.Int32(system.col),
+                                       mi.Float64(system.data), MatrixType.COO)
 
     def __call__(self, values: mi.Float) -> mi.Float:
         """Diffuses a flat field of one value, or of interleaved channels, per vertex."""

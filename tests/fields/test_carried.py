@@ -28,7 +28,7 @@ def _both(move):
     exists = [np.unpackbits(lattice.exists.numpy().view(np.uint8), bitorder="little").astype(bool)
               for lattice in (move.before, move.after)]
     kept = np.isin(ids[1], ids[0][exists[0]]) & exists[1]
-    where = np.searchsorted(np.where(exists[0], ids[0], -1)[exists[0]], ids[1][kept])
+    where = np.searchsorted(ids[0][exists[0]], ids[1][kept])
     return kept, np.flatnonzero(exists[0])[where], exists[1]
 
 

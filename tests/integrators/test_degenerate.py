@@ -95,7 +95,7 @@ def test_a_sample_that_is_no_number_is_left_out():
 
     broken, whole = image(np.nan), image(0.5)
     assert np.isfinite(broken).all()
-    changed = np.any(broken != whole, axis=-1)
+    changed = np.abs(broken - whole).max(axis=-1) > 1e-5    # rounding differs from run to run on a GPU
     assert changed[8, 8] and 0 < changed.mean() < 0.25
 
 

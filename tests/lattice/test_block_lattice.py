@@ -21,6 +21,14 @@ def lattice(request):
 
 def _assert_equal(a, b):
     for x, y in zip(a.to_numpy(), b.to_numpy(), strict=True):
+        _assert_equal_numbers(x, y)
+
+
+def _assert_equal_numbers(x, y):
+    """Bit by bit, but on a GPU, whose compiler fuses multiplications and additions as it likes."""
+    if np.issubdtype(x.dtype, np.floating) and mi.variant().startswith("cuda"):
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-7)
+    else:
         np.testing.assert_array_equal(x, y)
 
 
@@ -64,8 +72,7 @@ def test_same_mesh_while_the_blocks_follow_the_surface(lattice):
         _assert_equal(mesh, dense)
         _assert_equal(mesh.template, dense.template)
         color = lattice.points(mi.Float).y
-        np.testing.assert_array_equal(mesh.interpolate(blocks.take(color)).numpy(),
-                                      dense.interpolate(color).numpy())
+        _assert_equal_numbers(mesh.interpolate(blocks.take(color)).numpy(), dense.interpolate(color).numpy())
         blocks = blocks.around_cells(mesh.cells, lambda new, sdf=fields["sdf"]: new.take(sdf))
         assert blocks.fraction < 0.5 and blocks.covers(extract(blocks, **_taken(blocks, fields)).cells)
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bowl import CLOSED, SHORT
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "pipelines"))
 import profile_iteration
@@ -25,6 +26,14 @@ def test_phases_of_a_step(bowl_scene):
     assert set(seconds) == {"extraction", "scene update", "render", "losses", "backward", "render backward",
                             "optimiser"}
     assert free == 1 and min(seconds.values()) > 0
+
+
+def test_goes_on_from_a_finished_fit(bowl_scene, tmp_path):
+    from gshell_mi.fit.__main__ import main
+
+    assert main([str(bowl_scene), "-o", str(tmp_path), "--quiet", *SHORT, *CLOSED]) == 0
+    joint = profile_iteration.joint_stage(bowl_scene, tmp_path)
+    assert joint.config.iterations == 12 and joint.step(12)["psnr"] > 20
 
 
 def test_table():

@@ -137,6 +137,9 @@ def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.nd
             ray = volume.views.rays(sample.view, sample.film)
             near, far = (ghost.scene.ray_intersect_preliminary(ray, coherent=False)
                          for ghost in (before, after))
+            # On a GPU, a kernel traces rays in one scene only.
+            dr.eval(near)
+            dr.eval(far)
             start = volume.to_lattice @ ray(near.t)
             through = near.is_valid() & ~far.is_valid()
             end = dr.select(through, start, volume.to_lattice @ ray(far.t))

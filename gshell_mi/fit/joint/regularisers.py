@@ -122,14 +122,17 @@ class Regularisers:
 
     def _template_msdf(self) -> mi.Float:
         """ν in cells where the view's rays meet the template first, attached to the field; 0 elsewhere."""
-        ray, _ = self._first_hits
+        ray, first = self._first_hits
         with dr.suspend_grad():
+            # On a GPU, a kernel traces rays in one scene only.
+            dr.eval(ray, first)
             mesh = mi.Mesh("template", self._template.vertex_count, self._template.face_count)
             parameters = mi.traverse(mesh)
             parameters["vertex_positions"] = dr.ravel(dr.detach(self._template.vertices))
             parameters["faces"] = dr.ravel(self._template.faces)
             parameters.update()
             hit = mi.load_dict({"type": "scene", "template": mesh}).ray_intersect_preliminary(ray)
+            dr.eval(hit)
         valid = hit.is_valid()
         face = dr.gather(mi.Vector3u, dr.ravel(self._template.faces), hit.prim_index, valid)
         uv = dr.select(valid, hit.prim_uv, 0)
