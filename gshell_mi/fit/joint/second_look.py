@@ -92,6 +92,7 @@ class SecondLook:
         self._judges = (self._changes + count + 1) // 2
         if config.field != "explicit" or config.watertight or self._judges >= count:
             self._changes = count     # never
+        self._looks = self._changes < count
         self._state = {name: array for name, array in state.items() if name.startswith(_PREFIX)}
         if (held := self._state.pop(f"{_PREFIX}held", None)) is not None:
             joint.geometry.held = mi.Bool(held)
@@ -118,8 +119,21 @@ class SecondLook:
 
         Growing must not change how many boundary loops there are. Where rims have met in the steps
         afterwards, a strip of the surface comes back. If that does not help, but undoing all does, all is
-        undone. If nothing helps, as loops have come or gone elsewhere, what comes nearest stays.
+        undone. If nothing helps, as loops have come or gone elsewhere, what comes nearest stays. Loose sheets
+        that have closed on the way, or have come back of themselves, open on one side.
         """
+        changed = self._settle()
+        if self._looks:
+            template, vertices, faces, values = self._template()
+            opened = self._openings(vertices, faces, values)
+            side = self._sheet_sides(template, vertices, faces, opened)
+            if opened.any() and side.any():
+                self._write(template, np.where(side, -self._scale, values), side)
+                self.joint.finish()
+        return changed
+
+    def _settle(self) -> bool | None:
+        """Keeps or undoes what has changed, by the boundary loops that come of it; see ``finish``."""
         kept = self._state.get(f"{_PREFIX}kept")
         if kept is None or not kept.any():
             self.joint.finish()
@@ -212,10 +226,22 @@ class SecondLook:
 
     def _sheet_sides(self, template: SurfaceMesh, vertices: np.ndarray, faces: np.ndarray,
                      others: np.ndarray) -> np.ndarray:
-        """(V,) one side of each small loose part that is a sheet and has none of the others (V,)."""
-        part, areas = mesh_components(faces, len(vertices)), vertex_areas(vertices, faces)
-        large = np.bincount(part, areas) > _SMALL * areas.sum()
-        return small_sheets(vertices, template.vertex_normals().numpy().T, faces, others | large[part],
+        """(V,) one side of each small part without the others (V,) that is a closed sheet.
+
+        What it borders of them must be small beside it, as a neck that has been cut, by which the template
+        joins it to more than itself.
+        """
+        areas = vertex_areas(vertices, faces)
+        whole, faces = areas.sum(), faces[~others[faces].any(axis=1)]
+        part = mesh_components(faces, len(vertices))
+        area = np.bincount(part, areas)
+        edges, uses = mesh_edges(faces)
+        start, end = edges[uses == 1].T
+        rim = np.bincount(part[start], np.linalg.norm(vertices[end] - vertices[start], axis=1), len(area))
+        # Any flat piece has twice that rim or more.
+        left_out = ((area > _SMALL * whole) | (rim**2 >= np.pi * area))[part]
+        left_out |= np.bincount(faces.ravel(), minlength=len(vertices)) == 0
+        return small_sheets(vertices, template.vertex_normals().numpy().T, faces, left_out,
                             _SHEET * self.joint.subject.cell_size)[0]
 
     def _undo(self, chosen: np.ndarray) -> None:

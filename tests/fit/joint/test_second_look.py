@@ -430,6 +430,32 @@ def test_a_loose_sheet_has_one_side(evidence_above, monkeypatch, thickness, loop
     assert joint.geometry.held is None
 
 
+@pytest.mark.parametrize("neck", [False, True])
+def test_a_loose_sheet_that_closes_opens_in_the_end(evidence_above, monkeypatch, neck):
+    """But for a speck, which is noise, or for where the template goes on from its edge."""
+    monkeypatch.setattr(second_look, "_SMALL", 0.8)
+    evidence_above |= {"empty": 0.1}
+    joint, cell = ball_and_disc(1.2, 0.05), LATTICE.spacing
+    x, y, z = LATTICE.vertex_positions().T
+    msdf = np.where(x > 0.3, 0.05, joint.subject.msdf.numpy())
+    if neck:
+        bar = np.maximum(np.hypot(x - 0.65, z) - 1.1 * cell, np.abs(y - 5.5 * cell) - 2.5 * cell)
+        sdf = np.minimum(joint.subject.sdf.numpy(), bar)
+        joint.subject.set_fields(replace(joint.subject.fields(), sdf=sdf.astype(np.float32)))
+        msdf[(x > 0.3) & (y > 4.8 * cell)] = -0.02
+    else:
+        msdf[(x > 0.65) & (np.hypot(y, z) < 0.6 * cell)] = -0.02
+    worker = run(joint, range(7))
+    joint.geometry.replace("msdf", mi.Float(msdf.astype(np.float32)))
+    joint.apply(geometry=True)
+    found = topology(*joint.subject.surface.to_numpy()[:2])
+    assert found.boundary_loops + found.pinholes == 2
+    assert worker.finish() is None
+    found = topology(*joint.subject.surface.to_numpy()[:2])
+    assert (found.components, found.boundary_loops, found.pinholes) == (2, 2, 0)
+    assert found.boundary_length > 1.3 * 2 * np.pi * RADIUS
+
+
 @pytest.mark.parametrize("settings", [{"second_look": 1.0}, {"watertight": True}, {"field": "hashgrid"},
                                       {"iterations": 1}])
 def test_modes_without_it(evidence_above, settings):
