@@ -90,7 +90,9 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, 
         proposed = clean(np.where(_in_empty_space(after, volume, opacity, seen), -_CERTAIN, cleaned))
         ghost = RadianceGhost(after.start, after.faces, volume.views, known, volume.config)
         ghost.refit_anew(proposed > 0)
-        cleaned = clean(close_unjustified(proposed, after.faces, ghost.image_error, volume.config.ghost_gain))
+        justified = close_unjustified(proposed, after.faces, ghost.image_error, volume.config.ghost_gain)
+        # Those that there were have been judged, and a close call may come out otherwise now.
+        cleaned = clean(np.where(cleaned > 0, justified, proposed))
     radiance, found = splat_to_lattice(mi.Float(ghosts[1].radiance()[0].ravel()), after.mesh, lattice)
     msdf = without_specks(msdf_from_template(cleaned, after.mesh, lattice), after.mesh, lattice,
                           volume.config.ghost_min_area)

@@ -16,6 +16,7 @@ from gshell_mi.lattice import make_lattice
 
 RESOLUTION = 32
 CELL = 2 / RESOLUTION
+LATTICE = make_lattice("tet", RESOLUTION)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def trained():
     state = {"sdf": field, "hull": field, "msdf": np.ones_like(field)}
     volumes = {}
 
-    def run(shape):
+    def run(shape, **fields):
         if shape not in volumes:
             views, _, targets = capture(shape())
             held_out = np.arange(len(views)) % 6 == 0
@@ -37,7 +38,7 @@ def trained():
             for step in range(CONFIG.carving_iterations):
                 volume.step(step)
             volumes[shape] = volume, known, unknown
-        return subject, state, carve(subject, state, subject.lattice, *volumes[shape])
+        return subject, state, carve(subject, state | fields, subject.lattice, *volumes[shape])
 
     return run
 
@@ -62,6 +63,20 @@ def test_a_block_stays(trained):
 def test_hollows_have_to_be_justified(trained, monkeypatch):
     monkeypatch.setattr(carving, "_GAIN", 0.0)
     assert trained(cup)[2] is None
+
+
+def test_openings_that_there_were_stay(trained, monkeypatch):
+    """Whatever is said of new ones; the bottom has one here."""
+    monkeypatch.setattr(carving, "close_unjustified", lambda logits, *_: np.abs(logits))
+    _, y, _ = LATTICE.vertex_positions().T
+    msdf = np.where(y < -HALF + CELL, -CELL, CELL).astype(np.float32)
+    carved = trained(cup, msdf=msdf)[2]
+    sdf = carved["sdf"].reshape((RESOLUTION + 1,) * 3)
+    centre = RESOLUTION // 2
+    assert sdf[centre, centre + round(0.5 * HALF / CELL), centre] > 0, "carved"
+    near = np.abs(carved["sdf"]) < CELL
+    assert (carved["msdf"][near & (y < -HALF + 0.5 * CELL)] < 0).mean() > 0.9
+    assert (carved["msdf"][near & (y > -HALF + 3 * CELL)] > 0).all()
 
 
 def test_new_parts_are_solid_and_old_ones_keep_their_opacity():
