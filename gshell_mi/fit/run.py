@@ -322,8 +322,10 @@ class _Fit:
 
     def _cuts(self, template: GhostTemplate, moved: np.ndarray) -> list[Cut]:
         """How to cut a moved template, the best first."""
-        found = topology(*positive_part(template.vertices, template.faces, template.logits))
-        as_found = Cut(template.logits, moved, found, found.boundary_loops)
+        # What has become too small by moving is noise, and no reason to leave all where it was.
+        logits = clean_opacity(template.logits, moved, template.faces, self.config.ghost_min_area)
+        found = topology(*positive_part(template.vertices, template.faces, logits))
+        as_found = Cut(logits, moved, found, found.boundary_loops)
         if self.config.watertight or not self.config.sheet_thickness:
             return [as_found]
         cut = without_spare_sides(as_found, template.vertices, template.faces, self.scene.subject.cell_size,
