@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from ...extraction.surface_mesh import SurfaceMesh
 from ...fields.smoothing import MeshDiffusion
-from ...topology import equal_patches, mesh_components, mesh_edges, spread, topology
+from ...topology import boundary_edges, equal_patches, mesh_components, mesh_edges, spread, topology
 from ...triangles import positive_part, vertex_areas
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
@@ -92,7 +92,6 @@ class SecondLook:
         self._judges = (self._changes + count + 1) // 2
         if config.field != "explicit" or config.watertight or self._judges >= count:
             self._changes = count     # never
-        self._looks = self._changes < count
         self._state = {name: array for name, array in state.items() if name.startswith(_PREFIX)}
         if (held := self._state.pop(f"{_PREFIX}held", None)) is not None:
             joint.geometry.held = mi.Bool(held)
@@ -123,7 +122,7 @@ class SecondLook:
         that have closed on the way, or have come back of themselves, open on one side.
         """
         changed = self._settle()
-        if self._looks:
+        if self._changes < self.joint.config.iterations:
             template, vertices, faces, values = self._template()
             opened = self._openings(vertices, faces, values)
             side = self._sheet_sides(template, vertices, faces, opened)
@@ -235,8 +234,7 @@ class SecondLook:
         whole, faces = areas.sum(), faces[~others[faces].any(axis=1)]
         part = mesh_components(faces, len(vertices))
         area = np.bincount(part, areas)
-        edges, uses = mesh_edges(faces)
-        start, end = edges[uses == 1].T
+        start, end = boundary_edges(faces)[0].T
         rim = np.bincount(part[start], np.linalg.norm(vertices[end] - vertices[start], axis=1), len(area))
         # Any flat piece has twice that rim or more.
         left_out = ((area > _SMALL * whole) | (rim**2 >= np.pi * area))[part]
