@@ -126,9 +126,10 @@ class SecondLook:
             template, vertices, faces, values = self._template()
             opened = self._openings(vertices, faces, values)
             side = self._sheet_sides(template, vertices, faces, opened)
-            if opened.any() and side.any():
+            if opened.any():
                 self._write(template, np.where(side, -self._scale, values), side)
-                self.joint.finish()
+        # Looking at the template has brought the specks back.
+        self.joint.finish()
         return changed
 
     def _settle(self) -> bool | None:
