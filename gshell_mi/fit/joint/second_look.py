@@ -127,7 +127,7 @@ class SecondLook:
             opened = self._openings(vertices, faces, values)
             side = self._sheet_sides(template, vertices, faces, opened)
             if opened.any():
-                self._write(template, np.where(side, -self._scale, values), side)
+                self._write(template, -self._scale, side)
         # Looking at the template has brought the specks back.
         self.joint.finish()
         return changed
@@ -217,7 +217,7 @@ class SecondLook:
         elsewhere = 2 * np.bincount(part, back) < np.bincount(part)
         side = self._sheet_sides(template, vertices, faces,
                                  elsewhere[part] | self._openings(vertices, faces, values))
-        self._write(template, np.where(side, -self._scale, values), side)
+        self._write(template, -self._scale, side)
         for sheet in np.unique(part[side]):
             owner = np.bincount(patch[back & (part == sheet)]).argmax()
             self._state[f"{_PREFIX}spent"][owner] -= (1, 0)
@@ -247,11 +247,11 @@ class SecondLook:
         """Gives those patches that are chosen (P,) what they had before."""
         if not chosen.any():
             return
-        template, vertices, _, values = self._template()
+        template, vertices, _, _ = self._template()
         nearest, patch = self._patches(vertices)
         undone = (patch >= 0) & chosen[patch]
         before = self._state[f"{_PREFIX}values"][nearest]
-        self._write(template, np.where(undone, before, values), undone)
+        self._write(template, before, undone)
 
     def _loops_off(self, kept: np.ndarray) -> int:
         """By how much the surface's loops differ from those before but those of openings that were shut, and
@@ -271,7 +271,7 @@ class SecondLook:
         place = equal_patches(opened, faces)
         apart = opened & ~np.isin(place, place[others])
         ways = joined(others, apart & inside, vertices, faces, self._reach) & ~opened
-        self._write(template, np.where(ways, -self._scale, values), ways)
+        self._write(template, -self._scale, ways)
 
     def _part(self, kept: np.ndarray, width: int) -> None:
         """Shuts strips, ``width`` vertices wide on either side, where openings have met."""
@@ -282,7 +282,7 @@ class SecondLook:
         edges, _ = mesh_edges(faces)
         for _ in range(width):
             strip = spread(strip, edges)
-        self._write(template, np.where(strip, self._scale, values), strip)
+        self._write(template, self._scale, strip)
 
     def _inside(self, vertices: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Which vertices (V, 3) of the present template are in those patches that are chosen (P,)."""
@@ -330,8 +330,9 @@ class SecondLook:
         return explained(template, self.joint.scene, self.joint.integrator, self._views, self._pixels,
                          self.joint.seed(iteration), behind=behind)
 
-    def _write(self, template: SurfaceMesh, values: np.ndarray, changed: np.ndarray) -> mi.Float:
-        """Gives the mSDF new values (V,) at those vertices of the template that have changed (V,)."""
+    def _write(self, template: SurfaceMesh, values: np.ndarray | float, changed: np.ndarray) -> mi.Float:
+        """Gives the mSDF new values, (V,) or one, at those vertices of the template that have changed (V,)."""
+        values = np.broadcast_to(values, changed.shape)
         msdf = rewritten(self._msdf(), values, changed, template, self.joint.subject.lattice)
         self.joint.geometry.replace("msdf", msdf)
         return msdf
