@@ -331,7 +331,7 @@ class SecondLook:
                          self.joint.seed(iteration), behind=behind)
 
     def _write(self, template: SurfaceMesh, values: np.ndarray | float, changed: np.ndarray) -> mi.Float:
-        """Gives the mSDF new values, (V,) or one, at those vertices of the template that have changed (V,)."""
+        """Gives the mSDF new values, (V,) or one, at those vertices of the template that are chosen (V,)."""
         values = np.broadcast_to(values, changed.shape)
         msdf = rewritten(self._msdf(), values, changed, template, self.joint.subject.lattice)
         self.joint.geometry.replace("msdf", msdf)
