@@ -46,7 +46,7 @@ def test_a_step_compiles_nothing(bowl_scene, grid, settings):
                 launched += len(kernels)
                 # A kernel from the cache in memory was neither compiled nor loaded from disk.
                 compiled.append([k["size"] for k in kernels if not k["cache_hit"] or k["cache_disk"]])
-    assert len(counts) > 6, "the sizes must change for this to mean something"
+    assert len(counts) > 3, "the sizes must change for this to mean something"
     assert launched > 500
     # A few kernels come in variants, the rarer of which may turn up late; a size that was part of a kernel
     # would compile it in most steps.
