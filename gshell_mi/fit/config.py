@@ -22,10 +22,10 @@ _MOST = {"seed": 2**32 - 1, "hull_daylight_votes": 1, "ghost_min_area": 1, "unse
 _CALMER = 0.3
 
 #: What ``--preview`` has instead: less of everything, but for the steps that openings need.
-_PREVIEW = {"resolution": 48, "ghost_iterations": 600, "ghost_batch": 16384, "carving_iterations": 0,
-            "refinement_iterations": 0, "iterations": 70, "step_views": 1, "primal_spp": 4,
-            "max_depth": 2, "color_hold": 0, "even_start": False, "light_height": 16, "second_look": 1,
-            "triptychs": 4}
+_PREVIEW = {"resolution": 48, "ghost_iterations": 600, "ghost_batch": 16384, "ghost_rounds": 0,
+            "carving_iterations": 0, "refinement_iterations": 0, "iterations": 70, "step_views": 1,
+            "primal_spp": 4, "max_depth": 2, "color_hold": 0, "even_start": False, "light_height": 16,
+            "second_look": 1, "triptychs": 4}
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,8 @@ class FitConfig:
     """Weight of the tie between the chroma of a sheet's two sides."""
     ghost_gain: float = 0.9
     """An opening stays if the image error through it is below this fraction of what it is when closed."""
+    ghost_rounds: int = 3
+    """How often, at most, the ghost is trained again for what wrong openings have hidden."""
     ghost_min_area: float = 0.005
     """Holes and islands smaller than this fraction of the template's area are noise and are undone."""
 

@@ -40,10 +40,10 @@ from .cut.spare_sides import Cut, without_spare_sides
 from .cut.unseen import without_unseen
 from .findings import findings
 from .ghost.ghost_template import GhostTemplate, closed_template, ghost_template
-from .ghost.justified import close_unjustified, open_unjustified
 from .ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice
 from .ghost.pixels import PixelPool
 from .ghost.radiance_ghost import RadianceGhost
+from .ghost.rounds import find_openings
 from .joint.depth import check_depth
 from .joint.field_fitting import FieldFitting
 from .joint.joint import JointStage
@@ -236,7 +236,7 @@ class _Fit:
         with self.progress.stage("openings", None), self.books.timed("ghost"):
             logits = np.ones(len(vertices))
             if not self.config.watertight:
-                logits = self._openings(ghost, vertices, faces)
+                logits = find_openings(ghost, vertices, faces, partial(self._train_again, ghost))
             opened = logits <= 0
             ghost.refit(~opened)
         if opened.all():
@@ -251,13 +251,12 @@ class _Fit:
                          radiance=radiance, known=known.numpy(),
                          light=np.float32(light / TYPICAL_REFLECTANCE))
 
-    def _openings(self, ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """(V,) opacity logits of a fitted ghost, negative where the images justify an opening."""
-        clean = partial(clean_opacity, vertices=vertices, faces=faces, min_area=self.config.ghost_min_area)
-        logits = clean(ghost.smoothed_logits())
-        for judge in (close_unjustified, open_unjustified):
-            logits = clean(judge(logits, faces, ghost.image_error, self.config.ghost_gain))
-        return logits
+    def _train_again(self, ghost: RadianceGhost) -> None:
+        count = self.config.ghost_iterations
+        with self.progress.stage("ghost again", count) as advance:
+            for iteration in range(count):
+                self.interrupt.check()
+                advance({name: float(value) for name, value in ghost.step(iteration).items()})
 
     def _carve(self) -> None:
         """Hollows out what the hull bridges."""

@@ -117,6 +117,13 @@ class RadianceGhost:
         return {"loss": total[0], "image": image[0], "mask": mask[0],
                 "psnr": decibels(error[0])}
 
+    def begin_again(self, opaque: np.ndarray, opened: np.ndarray) -> None:
+        """Before all steps once more, with the radiance of now. The vertices ``opaque`` (V,) and ``opened``
+        (V,) are so at the start, and may change; the others' opacity is as it was at first."""
+        known = np.where(opaque, _CERTAIN_LOGIT, -_CERTAIN_LOGIT)
+        self._set_opacity(np.where(opaque | opened, known, _INITIAL_LOGIT))
+        self._opacity_rests = False
+
     def refit_anew(self, opaque: np.ndarray) -> None:
         """Fits the radiance as ``refit`` does, but from grey to where errors compare."""
         for _ in range(_ROUNDS_FROM_GREY):
