@@ -128,15 +128,15 @@ class SecondLook:
             side = self._sheet_sides(template, vertices, faces, opened)
             if opened.any():
                 self._write(template, -self._scale, side)
-        # Looking at the template has brought the specks back.
+        # Last of all: looking at the template brings the specks back.
         self.joint.finish()
         return changed
 
     def _settle(self) -> bool | None:
-        """Keeps or undoes what has changed, by the boundary loops that come of it; see ``finish``."""
+        """Keeps or undoes what has changed, by the boundary loops that come of it; see ``finish``, which
+        ends the stage."""
         kept = self._state.get(f"{_PREFIX}kept")
         if kept is None or not kept.any():
-            self.joint.finish()
             return None if kept is None else False
         self._join(kept)
         self.joint.finish()
@@ -158,7 +158,6 @@ class SecondLook:
             self._state[f"{_PREFIX}kept"] = none
             return False
         self.joint.geometry.replace("msdf", msdf)
-        self.joint.finish()
         return True
 
     def _change(self, iteration: int) -> None:
