@@ -35,8 +35,10 @@ def find_openings(ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray,
     """
     gain, clean = ghost.config.ghost_gain, partial(clean_opacity, vertices=vertices, faces=faces,
                                                    min_area=ghost.config.ghost_min_area)
+    # At a gain of 0 nothing will be justified.
+    rounds = ghost.config.ghost_rounds if gain > 0 else 0
     opened, unjustified = (np.zeros(len(vertices), bool) for _ in range(2))
-    for trained_again in range(ghost.config.ghost_rounds + 1):
+    for trained_again in range(rounds + 1):
         if trained_again:
             ghost.begin_again(unjustified, opened)
             train()

@@ -68,9 +68,10 @@ def test_false_openings_alone_are_reason_enough_for_another_round():
     np.testing.assert_array_equal(opened, ghost.cap((0, 0, 1)))
 
 
-def test_no_more_rounds_than_asked_for():
+@pytest.mark.parametrize(("settings", "found"), [({"ghost_rounds": 0}, True), ({"ghost_gain": 0.0}, False)])
+def test_no_rounds_that_are_not_asked_for_or_can_find_nothing(settings, found):
     ghost = ScriptedGhost(((0, 0, 1), (0, 1, 0)), ((0, 1, 0),), ((1, 0, 0),))
-    ghost.config = FitConfig(ghost_rounds=0)
+    ghost.config = FitConfig(**settings)
     opened = find_openings(ghost, VERTICES, FACES, ghost.train) <= 0
     assert ghost.rounds == 0
-    np.testing.assert_array_equal(opened, ghost.cap((0, 0, 1)))
+    np.testing.assert_array_equal(opened, ghost.cap((0, 0, 1)) & found)
