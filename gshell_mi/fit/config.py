@@ -97,6 +97,9 @@ class FitConfig:
     """Holes and islands smaller than this fraction of the template's area are noise and are undone."""
 
     # --- carving: folds and hollows that the hull bridges
+    vessel_gain: float = 0.75
+    """Openings lead into the hollow of something solid, such as a mug, if a wall behind them brings the image
+    error through them below this fraction."""
     carving_iterations: int = 1000
     """Steps of the radiance volume; 0 leaves the hull as it is."""
     carving_batch: int = 65536

@@ -34,6 +34,7 @@ from .bookkeeping.observer import Observer
 from .bookkeeping.progress import Progress
 from .carving.carving import carve
 from .carving.radiance_volume import RadianceVolume
+from .carving.vessels import hollowed_vessels
 from .config import FitConfig, default_output
 from .cut.recast import recast
 from .cut.spare_sides import Cut, without_spare_sides
@@ -260,10 +261,14 @@ class _Fit:
 
     def _carve(self) -> None:
         """Hollows out what the hull bridges."""
-        state, count = self.checkpoint.arrays, self.config.carving_iterations
+        count = self.config.carving_iterations
         carved = None
         # The volume lives on a lattice of cubes.
-        if count and self.lattice.vertex_count == self.lattice.stride**3:
+        cubes = self.lattice.vertex_count == self.lattice.stride**3
+        if cubes and self.checkpoint.iteration == 0:
+            self._hollow_vessels()
+        state = self.checkpoint.arrays
+        if cubes and count:
             _, vertices, faces = closed_template(self.scene.subject, state["hull"], self.lattice)
             known, unknown = self._split_pixels()
             volume = RadianceVolume(state["hull"].reshape((self.lattice.stride,) * 3), vertices, faces,
@@ -275,6 +280,16 @@ class _Fit:
         self.checkpoint.facts["carved"] = carved is not None
         kept = {name: state[name] for name in ("hull", *_SURFACE)}
         self.books.enter("refinement", **(kept | (carved or {})), light=state["light"])
+
+    def _hollow_vessels(self) -> None:
+        """Makes hollows of the openings that are no openings but mouths of vessels."""
+        state = self.checkpoint.arrays
+        with self.progress.stage("vessels", None), self.books.timed("carving"):
+            hollowed = hollowed_vessels(self.scene.subject, state, self.lattice, self.views,
+                                        *self._split_pixels(), self.config)
+        self.checkpoint.facts["vessel"] = hollowed is not None
+        if hollowed:
+            self.checkpoint.arrays = state | hollowed
 
     def _refine(self) -> None:
         """Moves the template inside the hull, and the fields with it."""

@@ -19,7 +19,8 @@ from ..ghost.justified import close_unjustified
 from ..ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
 from ..ghost.pixels import PixelPool
 from ..ghost.radiance_ghost import RadianceGhost
-from .hollows import SEEN, hollows
+from .fitted_ghost import fitted_ghost
+from .hollows import SEEN, carved_fields, hollows
 from .radiance_volume import RadianceVolume
 
 #: A hollow is kept if the error of rays that see into it falls below this fraction.
@@ -59,14 +60,14 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, 
                        opacity, seen)
     if distance is None:
         return None
-    carved = _carved(state, distance, lattice.spacing)
+    carved = carved_fields(state, distance, lattice.spacing)
     if not (carved["sdf"] < 0).any():
         return None
     before = ghost_template(subject, state, lattice)
     after = ghost_template(subject, carved, lattice, like=before)
     label, count = ndimage.label(distance > 0, np.ones((3, 3, 3)))
     label = np.where(label, label, ndimage.maximum_filter(label, size=3))
-    ghosts = [_fitted(template, volume, known) for template in (before, after)]
+    ghosts = [fitted_ghost(template, volume.views, known, volume.config) for template in (before, after)]
     errors = _errors_in_hollows(*ghosts, label, count, volume, unknown, lattice.spacing)
     kept = errors[1] < _GAIN * errors[0]
     if not kept[1:].any():
@@ -75,9 +76,9 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, 
         # Vertices beside a hollow belong to it.
         owner = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
         distance = np.where(kept[label[tuple(owner)]], distance, -np.inf)
-        carved = _carved(state, distance, lattice.spacing)
+        carved = carved_fields(state, distance, lattice.spacing)
         after = ghost_template(subject, carved, lattice, like=before)
-        ghosts[1] = _fitted(after, volume, known)
+        ghosts[1] = fitted_ghost(after, volume.views, known, volume.config)
     clean = partial(clean_opacity, vertices=after.vertices, faces=after.faces,
                     min_area=volume.config.ghost_min_area)
     cleaned = clean(after.logits)
@@ -100,12 +101,6 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, 
                      "known": found.numpy()}
 
 
-def _carved(state: Mapping[str, np.ndarray], distance: np.ndarray, spacing: float) -> dict[str, np.ndarray]:
-    fields = {name: np.maximum(state[name], spacing * distance.ravel()).astype(np.float32)
-              for name in ("sdf", "hull")}
-    return fields | {"msdf": state["msdf"]}
-
-
 def _in_empty_space(template: GhostTemplate, volume: RadianceVolume, opacity: np.ndarray,
                     seen: np.ndarray) -> np.ndarray:
     """(V,) whether there is nothing within a cell of a vertex, and it is seen."""
@@ -114,12 +109,6 @@ def _in_empty_space(template: GhostTemplate, volume: RadianceVolume, opacity: np
     around = ndimage.gaussian_filter(opacity, 1.0)
     return ((ndimage.map_coordinates(around, index, order=1) < _EMPTY)
             & (ndimage.map_coordinates(seen, index, order=1) > SEEN))
-
-
-def _fitted(template: GhostTemplate, volume: RadianceVolume, pixels: PixelPool) -> RadianceGhost:
-    ghost = RadianceGhost(template.start, template.faces, volume.views, pixels, volume.config, glossy=True)
-    ghost.refit_anew(template.solid)
-    return ghost
 
 
 def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.ndarray, count: int,

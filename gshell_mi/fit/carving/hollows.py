@@ -8,6 +8,8 @@ what is opaque (Boykov and Kolmogorov, ICCV 2003).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy import ndimage
 from scipy.sparse import coo_matrix
@@ -63,6 +65,20 @@ def hollows(hull: np.ndarray, msdf: np.ndarray, opacity: np.ndarray, seen: np.nd
     distance = ndimage.distance_transform_edt(air) - ndimage.distance_transform_edt(~air)
     near = ndimage.binary_dilation(hollow, iterations=3)
     return np.where(near, ndimage.gaussian_filter(distance, _DISTANCE_BLUR), -np.inf)
+
+
+def carved_fields(state: Mapping[str, np.ndarray], distance: np.ndarray,
+                  spacing: float) -> dict[str, np.ndarray]:
+    """``sdf``, ``hull`` and ``msdf`` of a template without the hollows.
+
+    Args:
+        state: the same of the template with them.
+        distance: signed distances to the hollows, in cells, positive inside.
+        spacing: of the lattice.
+    """
+    fields = {name: np.maximum(state[name], spacing * distance.ravel()).astype(np.float32)
+              for name in ("sdf", "hull")}
+    return fields | {"msdf": state["msdf"]}
 
 
 def _minimum_cut(inside: np.ndarray, lid: np.ndarray, opacity: np.ndarray, hidden: np.ndarray) -> np.ndarray:

@@ -1,0 +1,225 @@
+"""Vessels: openings of the ghost that lead into the hollow of something solid, such as a mug's mouth.
+
+Where the hull's cap does not look like the object the ghost opens it. What is seen through it then is the
+back of the hull's walls, as if these were as thin as cloth. The inside of a mug is nearer than that, by the
+thickness of its wall, so every view sees it elsewhere. Therefore each space behind openings is also tried as
+a hollow: all of the hull goes but a wall. If that explains unseen views much better, the space is a hollow,
+and the openings into it are none. Behind the openings of cloth such a wall explains them worse, by factors;
+so one thickness tells, and only for a vessel is it varied, as is the hollow's depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from ... import losses
+from ...lattice import Lattice
+from ...views import PinholeViews
+from ..config import FitConfig
+from ..ghost.ghost_template import GhostTemplate, ghost_template
+from ..ghost.opening import msdf_from_template, splat_to_lattice
+from ..ghost.pixels import PixelPool
+from ..ghost.radiance_ghost import RadianceGhost
+from .fitted_ghost import fitted_ghost
+from .hollows import carved_fields
+
+#: Thickness of a wall, in cells, that tells vessels; those that are tried for them then.
+_TELLING, _THINNER, _THICKER = 2.5, (1.5,), (4.0, 6.0, 9.0)
+
+#: Depths that are tried, as fractions of the deepest.
+_DEPTHS = (0.75, 0.5, 0.25)
+
+#: Vertices up to this many cells from an opening lie right behind it.
+_BEHIND = 1.5
+
+#: Share of a batch that tells: errors differ by factors.
+_BATCH = 0.25
+
+#: Fewest rays through openings that tell, and batches of rays.
+_ENOUGH, _ERROR_STEPS = 100, 20
+
+#: Logit of a vertex that is taken to be surface.
+_CERTAIN = 3.0
+
+
+def hollowed_vessels(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice,
+                     views: PinholeViews, known: PixelPool, unknown: PixelPool,
+                     config: FitConfig) -> dict[str, np.ndarray] | None:
+    """Hollows a template out behind openings where that explains unseen views much better.
+
+    Args:
+        subject: the gshell shape; it is left with other fields.
+        state: ``sdf``, ``hull`` and ``msdf`` on the lattice.
+        lattice: whose vertices make a cube.
+        known, unknown: pixels to fit the radiance of templates to, and those that judge them.
+        config: ``vessel_gain`` and what concerns the ghost.
+
+    Returns:
+        ``sdf``, ``hull``, ``msdf``, ``radiance`` (n, 3) and ``known`` (n,) on the lattice; None if no opening
+        leads into a hollow.
+    """
+    template = ghost_template(subject, state, lattice)
+    if template.solid.all() or not template.solid.any() or not config.vessel_gain:
+        return None
+    trials = _Trials(subject, state, lattice, template, views, known, unknown, config)
+    vessel = trials.best()
+    if vessel is None:
+        return None
+    carved, radiance = vessel.template, vessel.ghost.radiance()[0]
+    radiance, found = splat_to_lattice(mi.Float(radiance.ravel()), carved.mesh, lattice)
+    msdf = msdf_from_template(carved.logits, carved.mesh, lattice)
+    return vessel.fields | {"msdf": msdf.numpy(), "radiance": radiance.numpy().reshape(-1, 3),
+                            "known": found.numpy()}
+
+
+@dataclass(frozen=True)
+class _Hollow:
+    """A hollow behind openings.
+
+    Attributes:
+        mouth: (V,) which vertices of the template without it are these openings.
+        thickness: of the wall, in cells.
+        depth: of its deepest point below the openings, in cells.
+        distance: (n,) signed distance on the lattice, in cells, positive inside; -inf outside of the hull.
+        space: (V,) id of its connected part that is nearest to a vertex.
+    """
+
+    mouth: np.ndarray
+    thickness: float
+    depth: float
+    distance: np.ndarray
+    space: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Vessel:
+    """A template with a hollow, on trial.
+
+    Attributes:
+        fields: what it comes from, but for the openings that are none.
+        template: without the openings into the hollow.
+        ghost: fitted to it.
+        errors: (V,) of rays, by the vertex of the template without the hollow that they meet first.
+    """
+
+    hollow: _Hollow
+    fields: dict[str, np.ndarray]
+    template: GhostTemplate
+    ghost: RadianceGhost
+    errors: np.ndarray
+
+    @property
+    def error(self) -> float:
+        """Of the rays into the hollow."""
+        return self.errors[self.hollow.mouth].sum()
+
+
+class _Trials:
+    """Tries hollows behind the openings of a template; arguments as of ``hollowed_vessels``."""
+
+    def __init__(self, subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice,
+                 template: GhostTemplate, views: PinholeViews, known: PixelPool, unknown: PixelPool,
+                 config: FitConfig):
+        self.subject, self.state, self.lattice, self.template = subject, state, lattice, template
+        self.views, self.known, self.unknown = views, known, unknown
+        self.config = replace(config, ghost_batch=max(round(_BATCH * config.ghost_batch), 1))
+        points = mi.Transform4f(subject.to_world) @ lattice.points(mi.Float)
+        self._inside = state["hull"] < 0
+        self._points = points.numpy().T[self._inside]
+        self._sheet = fitted_ghost(template, views, known, self.config)
+
+    def best(self) -> _Vessel | None:
+        """The vessel that explains most; None if there is none."""
+        opened = ~self.template.solid
+        first = self._vessel(opened, _TELLING)
+        if first is None:
+            return None
+        space = first.hollow.space
+        before, rays = self._errors(self._sheet)
+        error, was, enough = (np.bincount(space[opened], values[opened], space.max() + 1)
+                              for values in (first.errors, before, rays))
+        hollow = (error < self.config.vessel_gain * was) & (enough >= _ENOUGH)
+        mouth = opened & hollow[space]
+        if not mouth.any():
+            return None
+        if not hollow[space[opened]].all():
+            first = self._vessel(mouth, _TELLING)
+            if first is None:
+                return None
+        best = self._better(first, ((thickness, np.inf) for thickness in _THICKER))
+        if best is first:
+            best = self._better(first, ((thickness, np.inf) for thickness in _THINNER))
+        wall, depth = best.hollow.thickness, best.hollow.depth
+        return self._better(best, ((wall, fraction * depth) for fraction in _DEPTHS))
+
+    def _better(self, best: _Vessel, others: Iterable[tuple[float, float]]) -> _Vessel:
+        """The last one of a sequence of walls and depths up to which errors fall."""
+        for thickness, depth in others:
+            other = self._vessel(best.hollow.mouth, thickness, depth)
+            if other is None or other.error >= best.error:
+                break
+            best = other
+        return best
+
+    def _vessel(self, mouth: np.ndarray, thickness: float, depth: float = np.inf) -> _Vessel | None:
+        """The template with such a hollow; None if that is none."""
+        hollow = self._hollow(mouth, thickness, depth)
+        if hollow is None:
+            return None
+        fields = carved_fields(self.state, hollow.distance, self.lattice.spacing)
+        closed = replace(self.template, logits=np.where(mouth, _CERTAIN, self.template.logits))
+        carved = ghost_template(self.subject, fields, self.lattice, like=closed)
+        ghost = fitted_ghost(carved, self.views, self.known, self.config)
+        return _Vessel(hollow, fields, carved, ghost, self._errors(ghost)[0])
+
+    def _hollow(self, mouth: np.ndarray, thickness: float, depth: float) -> _Hollow | None:
+        """What lies behind openings and deeper than a wall; None if that is nothing."""
+        vertices, cell = self.template.vertices, self.subject.cell_size
+        to_wall, to_mouth = (cKDTree(vertices[chosen]).query(self._points)[0] / cell
+                             for chosen in (~mouth, mouth))
+        # The wall ends at the opening's rim.
+        inside = np.maximum(to_wall - thickness, (to_wall - to_mouth) / np.sqrt(2))
+        distance = np.full(self._inside.shape, -np.inf)
+        distance[self._inside] = np.minimum(inside, depth - to_mouth)
+        behind = np.zeros(self._inside.shape, bool)
+        behind[self._inside] = to_mouth < _BEHIND
+        shape = (self.lattice.stride,) * 3
+        part = ndimage.label((distance > 0).reshape(shape))[0].ravel()
+        reached = np.unique(part[behind & (part > 0)])
+        if not len(reached):
+            return None
+        # Thick parts elsewhere are no hollows.
+        distance[(part > 0) & ~np.isin(part, reached)] = -np.inf
+        hollow = distance[self._inside] > 0
+        nearest = cKDTree(self._points[hollow]).query(vertices)[1]
+        space = part[self._inside][hollow][nearest]
+        return _Hollow(mouth, thickness, to_mouth[hollow].max(), distance, space)
+
+    def _errors(self, ghost: RadianceGhost) -> tuple[np.ndarray, np.ndarray]:
+        """(V,) sums of a ghost's errors, and numbers of rays, by the vertex that these meet first."""
+        pixels, config = self.unknown, self.config
+        errors, rays = (dr.zeros(mi.Float, len(self.template.vertices)) for _ in range(2))
+        vertex = mi.UInt32(self.template.faces[:, 0].astype(np.uint32))
+        coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0))
+        with dr.suspend_grad():
+            for step in range(_ERROR_STEPS):
+                sample = pixels.sample(config.ghost_batch, seed=config.seed, step=step)
+                ray = self.views.rays(sample.view, sample.film)
+                hit = self._sheet.scene.ray_intersect_preliminary(ray, coherent=False)
+                # On a GPU, a kernel traces rays in one scene only.
+                dr.eval(hit)
+                first = dr.gather(mi.UInt32, vertex, hit.prim_index, hit.is_valid())
+                radiance, alpha = ghost.see(ray)
+                error = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
+                error = error.x + error.y + error.z + coverage * dr.abs(alpha - sample.alpha)
+                for total, values in ((errors, error), (rays, mi.Float(1))):
+                    dr.scatter_reduce(dr.ReduceOp.Add, total, values, first, hit.is_valid())
+                dr.eval(errors, rays)
+        return errors.numpy(), rays.numpy()
