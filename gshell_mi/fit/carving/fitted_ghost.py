@@ -9,9 +9,9 @@ from ..ghost.pixels import PixelPool
 from ..ghost.radiance_ghost import RadianceGhost
 
 
-def fitted_ghost(template: GhostTemplate, views: PinholeViews, pixels: PixelPool,
-                 config: FitConfig) -> RadianceGhost:
-    """A glossy ghost, its radiance fitted to ``pixels`` from grey."""
+def fitted_ghost(template: GhostTemplate, views: PinholeViews, pixels: PixelPool, config: FitConfig,
+                 **rounds: int) -> RadianceGhost:
+    """A glossy ghost, its radiance fitted to ``pixels`` from grey; ``rounds`` as of its ``refit_anew``."""
     ghost = RadianceGhost(template.start, template.faces, views, pixels, config, glossy=True)
-    ghost.refit_anew(template.solid)
+    ghost.refit_anew(template.solid, **rounds)
     return ghost

@@ -39,8 +39,8 @@ _DEPTHS = (0.75, 0.5, 0.25)
 #: Vertices up to this many cells from an opening lie right behind it.
 _BEHIND = 1.5
 
-#: Share of a batch that tells: errors differ by factors.
-_BATCH = 0.25
+#: Share of a batch, and rounds of fitting, that tell: errors differ by factors.
+_BATCH, _ROUNDS = 0.25, 1
 
 #: Fewest rays through openings that tell, and batches of rays.
 _ENOUGH, _ERROR_STEPS = 100, 20
@@ -133,7 +133,7 @@ class _Trials:
         points = mi.Transform4f(subject.to_world) @ lattice.points(mi.Float)
         self._inside = state["hull"] < 0
         self._points = points.numpy().T[self._inside]
-        self._sheet = fitted_ghost(template, views, known, self.config)
+        self._sheet = self._fitted(template)
 
     def best(self) -> _Vessel | None:
         """The vessel that explains most; None if there is none."""
@@ -176,7 +176,7 @@ class _Trials:
         fields = carved_fields(self.state, hollow.distance, self.lattice.spacing)
         closed = replace(self.template, logits=np.where(mouth, _CERTAIN, self.template.logits))
         carved = ghost_template(self.subject, fields, self.lattice, like=closed)
-        ghost = fitted_ghost(carved, self.views, self.known, self.config)
+        ghost = self._fitted(carved)
         return _Vessel(hollow, fields, carved, ghost, self._errors(ghost)[0])
 
     def _hollow(self, mouth: np.ndarray, thickness: float, depth: float) -> _Hollow | None:
@@ -201,6 +201,9 @@ class _Trials:
         nearest = cKDTree(self._points[hollow]).query(vertices)[1]
         space = part[self._inside][hollow][nearest]
         return _Hollow(mouth, thickness, to_mouth[hollow].max(), distance, space)
+
+    def _fitted(self, template: GhostTemplate) -> RadianceGhost:
+        return fitted_ghost(template, self.views, self.known, self.config, rounds=_ROUNDS)
 
     def _errors(self, ghost: RadianceGhost) -> tuple[np.ndarray, np.ndarray]:
         """(V,) sums of a ghost's errors, and numbers of rays, by the vertex that these meet first."""

@@ -124,9 +124,10 @@ class RadianceGhost:
         self._set_opacity(np.where(opaque | opened, known, _INITIAL_LOGIT))
         self._opacity_rests = False
 
-    def refit_anew(self, opaque: np.ndarray) -> None:
-        """Fits the radiance as ``refit`` does, but from grey to where errors compare."""
-        for _ in range(_ROUNDS_FROM_GREY):
+    def refit_anew(self, opaque: np.ndarray, rounds: int = _ROUNDS_FROM_GREY) -> None:
+        """Fits the radiance as ``refit`` does, but from grey to where errors compare; in one round, to where
+        those do that differ by factors."""
+        for _ in range(rounds):
             self.refit(opaque)
 
     def refit(self, opaque: np.ndarray) -> None:
