@@ -13,7 +13,7 @@ REPOSITORY = Path(__file__).parents[1]
 sys.path.insert(0, str(REPOSITORY / "pipelines"))
 
 from scene_builder import cloth, files, lights, modelling  # noqa: E402
-from scene_builder.objects import bowl, chair, lace, leaf, skirt, vase  # noqa: E402
+from scene_builder.objects import bowl, chair, lace, leaf, mug, skirt, vase  # noqa: E402
 
 
 def ball(p):
@@ -190,7 +190,7 @@ def test_written_scene_comes_back(tmp_path):
     assert written.astype(float) == pytest.approx(light, rel=1e-3)
 
 
-@pytest.mark.parametrize("module", [bowl, lace, leaf, vase])
+@pytest.mark.parametrize("module", [bowl, lace, leaf, mug, vase])
 def test_committed_truth_is_what_the_code_builds(module):
     item = module.build()
     name = module.__name__.split(".")[-1]
