@@ -6,7 +6,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
@@ -231,13 +230,14 @@ class _Fit:
         template = ghost_template(self.scene.subject, closed, self.lattice)
         vertices, faces = template.vertices, template.faces
         ghost = RadianceGhost(template.start, faces, self.views, self.pixels, self.config)
+        count = self.config.ghost_iterations
         if not self.config.watertight:
-            self.books.iterate("ghost", self.config.ghost_iterations, ghost, {"ghost": ghost.optimizer},
-                               state)
+            self.books.iterate("ghost", count, ghost, {"ghost": ghost.optimizer}, state)
         with self.progress.stage("openings", None), self.books.timed("ghost"):
             logits = np.ones(len(vertices))
             if not self.config.watertight:
-                logits = find_openings(ghost, vertices, faces, partial(self._train_again, ghost))
+                logits = find_openings(ghost, vertices, faces, lambda again: self.books.repeat(
+                    "ghost", count, ghost, first=again * count))
             opened = logits <= 0
             ghost.refit(~opened)
         if opened.all():
@@ -251,13 +251,6 @@ class _Fit:
         self.books.enter("carving", sdf=state["sdf"], hull=state["hull"], msdf=msdf.numpy(),
                          radiance=radiance, known=known.numpy(),
                          light=np.float32(light / TYPICAL_REFLECTANCE))
-
-    def _train_again(self, ghost: RadianceGhost) -> None:
-        count = self.config.ghost_iterations
-        with self.progress.stage("ghost again", count) as advance:
-            for iteration in range(count):
-                self.interrupt.check()
-                advance({name: float(value) for name, value in ghost.step(iteration).items()})
 
     def _carve(self) -> None:
         """Hollows out what the hull bridges."""

@@ -93,12 +93,7 @@ class Bookkeeping:
                 if stalled(iteration):
                     break
                 begin = time.monotonic()
-                self.interrupt.check()
-                values = {name: float(value) for name, value in worker.step(iteration).items()}
-                self._write_log(stage, iteration, values, time.monotonic() - begin)
-                advance(values)
-                if self.observer:
-                    self.observer.step(stage, iteration, count, values, worker.preview)
+                advance(self._step(stage, iteration, count, worker, iteration))
                 self._spent(stage, time.monotonic() - begin)
                 if time.monotonic() - saved > pause:
                     begin = time.monotonic()
@@ -106,6 +101,13 @@ class Bookkeeping:
                     saved = time.monotonic()
                     pause = max(self.checkpoint_seconds, _CHECKPOINT_PAUSE * (saved - begin))
         save(count)
+
+    def repeat(self, stage: str, count: int, worker: Worker, first: int) -> None:
+        """Runs all steps of a stage once more, logged as those from ``first`` on; nothing is saved meanwhile,
+        so a fit that goes on does them again."""
+        with self.progress.stage(f"{stage} again", count) as advance:
+            for iteration in range(count):
+                advance(self._step(stage, first + iteration, first + count, worker, iteration))
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -125,6 +127,16 @@ class Bookkeeping:
                     kept.append(line)
         with replacing(self._log) as partial:
             partial.write_text("".join(kept))
+
+    def _step(self, stage: str, logged: int, count: int, worker: Worker, iteration: int) -> dict[str, float]:
+        """One step, which the log and the observer hear of as the step ``logged`` of ``count``."""
+        begin = time.monotonic()
+        self.interrupt.check()
+        values = {name: float(value) for name, value in worker.step(iteration).items()}
+        self._write_log(stage, logged, values, time.monotonic() - begin)
+        if self.observer:
+            self.observer.step(stage, logged, count, values, worker.preview)
+        return values
 
     def _spent(self, stage: str, seconds: float) -> None:
         self.checkpoint.seconds[stage] = round(self.checkpoint.seconds.get(stage, 0.0) + seconds, 3)

@@ -22,13 +22,13 @@ _OPEN = -1.0
 
 
 def find_openings(ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray,
-                  train: Callable[[], None]) -> np.ndarray:
+                  train: Callable[[int], None]) -> np.ndarray:
     """Where the images justify an opening.
 
     Args:
         ghost: after its training; it is trained further.
         vertices, faces: (V, 3) and (F, 3) of its template.
-        train: does all steps of its training.
+        train: does all steps of its training; told for which time, after the first, from 1.
 
     Returns:
         (V,) opacity logits, negative at openings.
@@ -41,7 +41,7 @@ def find_openings(ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray,
     for trained_again in range(rounds + 1):
         if trained_again:
             ghost.begin_again(unjustified, opened)
-            train()
+            train(trained_again)
         proposed = clean(ghost.smoothed_logits())
         proposed = np.where(opened, np.minimum(proposed, _OPEN), proposed)
         logits = proposed
