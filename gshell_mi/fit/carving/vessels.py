@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from ... import losses
 from ...lattice import Lattice
+from ...topology import equal_patches
 from ...views import PinholeViews
 from ..config import FitConfig
 from ..ghost.ghost_template import GhostTemplate, ghost_template
@@ -36,8 +37,8 @@ _TELLING, _THINNER, _THICKER = 2.5, (1.5,), (4.0, 6.0, 9.0)
 #: Depths that are tried, as fractions of the deepest.
 _DEPTHS = (0.75, 0.5, 0.25)
 
-#: Vertices up to this many cells from an opening lie right behind it.
-_BEHIND = 1.5
+#: Vertices up to this many cells from an opening lie right behind it, and hollows are deeper than this.
+_BEHIND, _SHALLOW = 1.5, 4.0
 
 #: Share of a batch, and rounds of fitting, that tell: errors differ by factors.
 _BATCH, _ROUNDS = 0.25, 1
@@ -88,7 +89,7 @@ class _Hollow:
         thickness: of the wall, in cells.
         depth: of its deepest point below the openings, in cells.
         distance: (n,) signed distance on the lattice, in cells, positive inside; -inf outside of the hull.
-        space: (V,) id of its connected part that is nearest to a vertex.
+        space: (V,) id of its connected part that a vertex's opening leads into.
     """
 
     mouth: np.ndarray
@@ -185,22 +186,25 @@ class _Trials:
         to_wall, to_mouth = (cKDTree(vertices[chosen]).query(self._points)[0] / cell
                              for chosen in (~mouth, mouth))
         # The wall ends at the opening's rim.
-        inside = np.maximum(to_wall - thickness, (to_wall - to_mouth) / np.sqrt(2))
+        within = np.maximum(to_wall - thickness, (to_wall - to_mouth) / np.sqrt(2))
         distance = np.full(self._inside.shape, -np.inf)
-        distance[self._inside] = np.minimum(inside, depth - to_mouth)
-        behind = np.zeros(self._inside.shape, bool)
-        behind[self._inside] = to_mouth < _BEHIND
-        shape = (self.lattice.stride,) * 3
-        part = ndimage.label((distance > 0).reshape(shape))[0].ravel()
-        reached = np.unique(part[behind & (part > 0)])
-        if not len(reached):
+        distance[self._inside] = np.minimum(within, depth - to_mouth)
+        part = ndimage.label((distance > 0).reshape((self.lattice.stride,) * 3))[0].ravel()
+        owner = part[self._inside]
+        nearest, deepest = (extremum(to_mouth, owner, range(1 + part.max()))
+                            for extremum in (ndimage.minimum, ndimage.maximum))
+        # Thick parts elsewhere are no hollows, nor are dents.
+        hollow = (np.arange(1 + part.max()) > 0) & (nearest < _BEHIND) & (deepest > _SHALLOW)
+        if not hollow.any():
             return None
-        # Thick parts elsewhere are no hollows.
-        distance[(part > 0) & ~np.isin(part, reached)] = -np.inf
-        hollow = distance[self._inside] > 0
-        nearest = cKDTree(self._points[hollow]).query(vertices)[1]
-        space = part[self._inside][hollow][nearest]
-        return _Hollow(mouth, thickness, to_mouth[hollow].max(), distance, space)
+        distance[(part > 0) & ~hollow[part]] = -np.inf
+        inside = hollow[owner]
+        space = owner[inside][cKDTree(self._points[inside]).query(vertices)[1]]
+        # An opening leads into one of them.
+        opening = equal_patches(mouth, self.template.faces)
+        votes = np.zeros((1 + opening.max(), 1 + part.max()))
+        np.add.at(votes, (opening[mouth], space[mouth]), 1)
+        return _Hollow(mouth, thickness, to_mouth[inside].max(), distance, votes.argmax(axis=1)[opening])
 
     def _fitted(self, template: GhostTemplate) -> RadianceGhost:
         return fitted_ghost(template, self.views, self.known, self.config, rounds=_ROUNDS)

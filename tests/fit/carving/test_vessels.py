@@ -83,6 +83,17 @@ def test_what_is_closed_stays():
     assert vessels(cup(), closed) is None
 
 
+def test_a_dent_is_no_hollow():
+    """However well it explains the images."""
+    low = HALF - 3.2 * CELL
+
+    def slab(points):
+        return np.maximum(block_distance(points, HALF), low - points[:, 1]), block_open_above(points)[1]
+
+    shape = block([-HALF, low, -HALF], [HALF] * 3)
+    assert vessels(shape, slab, config=replace(CONFIG, vessel_gain=1e6)) is None
+
+
 def test_only_the_cups_opening_goes_where_there_is_another():
     half, wall = 0.5 * HALF, 0.5 * WALL
 
