@@ -89,7 +89,7 @@ class FitConfig:
     """Final weight of the loss that closes what the images leave undecided."""
     ghost_chroma: float = 0.003
     """Weight of the tie between the chroma of a sheet's two sides."""
-    ghost_gain: float = 0.9
+    ghost_gain: float = 0.93
     """An opening stays if the image error through it is below this fraction of what it is when closed."""
     ghost_rounds: int = 3
     """How often, at most, the ghost is trained again for what wrong openings have hidden."""

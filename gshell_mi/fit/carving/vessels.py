@@ -34,8 +34,9 @@ from .hollows import carved_fields
 #: Thickness of a wall, in cells, that tells vessels; those that are tried for them then.
 _TELLING, _THINNER, _THICKER = 2.5, (1.5,), (4.0, 6.0, 9.0)
 
-#: Depths that are tried, as fractions of the deepest.
-_DEPTHS = (0.75, 0.5, 0.25)
+#: Depths that are tried, as fractions of the deepest. Few views see the bottom, so what a shallower hollow
+#: brings must be more than noise: it counts if errors fall below this fraction.
+_DEPTHS, _SHALLOWER = (0.75, 0.5, 0.25), 0.9
 
 #: Vertices up to this many cells from an opening lie right behind it, and hollows are deeper than this.
 _BEHIND, _SHALLOW = 1.5, 4.0
@@ -158,13 +159,14 @@ class _Trials:
         if best is first:
             best = self._better(first, ((thickness, np.inf) for thickness in _THINNER))
         wall, depth = best.hollow.thickness, best.hollow.depth
-        return self._better(best, ((wall, fraction * depth) for fraction in _DEPTHS))
+        return self._better(best, ((wall, fraction * depth) for fraction in _DEPTHS), _SHALLOWER)
 
-    def _better(self, best: _Vessel, others: Iterable[tuple[float, float]]) -> _Vessel:
-        """The last one of a sequence of walls and depths up to which errors fall."""
+    def _better(self, best: _Vessel, others: Iterable[tuple[float, float]], gain: float = 1.0) -> _Vessel:
+        """The last one of a sequence of walls and depths up to which errors fall, each below the fraction
+        ``gain`` of the one before."""
         for thickness, depth in others:
             other = self._vessel(best.hollow.mouth, thickness, depth)
-            if other is None or other.error >= best.error:
+            if other is None or other.error >= gain * best.error:
                 break
             best = other
         return best

@@ -13,7 +13,7 @@ _NECK = 2
 
 #: Openings below this fraction of the template's vertices have to be justified the better, by this factor,
 #: and by every choice of pixels: a bulge beside a handle is small, and few rays tell of a small opening.
-_SMALL, _STRICTER = 0.05, 0.75
+_SMALL, _STRICTER = 0.05, 0.725
 
 #: Rounds in which openings are closed, each time those that are this near to the worst; in the last one all.
 _CLOSINGS, _WORST = 5, 0.5
