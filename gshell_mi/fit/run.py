@@ -258,12 +258,13 @@ class _Fit:
         carved = None
         # The volume lives on a lattice of cubes.
         cubes = self.lattice.vertex_count == self.lattice.stride**3
-        if cubes and self.checkpoint.iteration == 0:
-            self._hollow_vessels()
+        if cubes:
+            known, unknown = self._split_pixels()
+            if self.checkpoint.iteration == 0:
+                self._hollow_vessels(known, unknown)
         state = self.checkpoint.arrays
         if cubes and count:
             _, vertices, faces = closed_template(self.scene.subject, state["hull"], self.lattice)
-            known, unknown = self._split_pixels()
             volume = RadianceVolume(state["hull"].reshape((self.lattice.stride,) * 3), vertices, faces,
                                     self.scene.subject.to_world, self.views, known, self.config,
                                     self.checkpoint.iteration)
@@ -274,12 +275,12 @@ class _Fit:
         kept = {name: state[name] for name in ("hull", *_SURFACE)}
         self.books.enter("refinement", **(kept | (carved or {})), light=state["light"])
 
-    def _hollow_vessels(self) -> None:
+    def _hollow_vessels(self, known: PixelPool, unknown: PixelPool) -> None:
         """Makes hollows of the openings that are no openings but mouths of vessels."""
         state = self.checkpoint.arrays
         with self.progress.stage("vessels", None), self.books.timed("carving"):
-            hollowed = hollowed_vessels(self.scene.subject, state, self.lattice, self.views,
-                                        *self._split_pixels(), self.config)
+            hollowed = hollowed_vessels(self.scene.subject, state, self.lattice, self.views, known, unknown,
+                                        self.config)
         self.checkpoint.facts["vessel"] = hollowed is not None
         if hollowed:
             self.checkpoint.arrays = state | hollowed

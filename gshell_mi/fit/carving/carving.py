@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ... import losses
 from ...lattice import Lattice
 from ...topology import topology
 from ...triangles import positive_part
@@ -19,7 +18,7 @@ from ..ghost.justified import close_unjustified
 from ..ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
 from ..ghost.pixels import PixelPool
 from ..ghost.radiance_ghost import RadianceGhost
-from .fitted_ghost import fitted_ghost
+from .fitted_ghost import fitted_ghost, ray_errors
 from .hollows import SEEN, carved_fields, hollows
 from .radiance_volume import RadianceVolume
 
@@ -121,7 +120,6 @@ def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.nd
     labels, side = mi.UInt32(label.ravel().astype(np.uint32)), dr.opaque(mi.UInt32, len(label))
     sums = [dr.zeros(mi.Float, count + 1) for _ in range(2)]
     config = volume.config
-    coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0))
     with dr.suspend_grad():
         for step in range(_ERROR_STEPS):
             sample = pixels.sample(config.ghost_batch, seed=config.seed, step=step)
@@ -138,9 +136,7 @@ def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.nd
             x, y, z = mi.Vector3u(dr.clip(dr.round((end + 1) / spacing), 0, mi.Float(side - 1)))
             hollow = dr.gather(mi.UInt32, labels, x + side * (y + side * z), deeper)
             for ghost, total in zip((before, after), sums, strict=True):
-                radiance, alpha = ghost.see(ray)
-                error = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
-                error = error.x + error.y + error.z + coverage * dr.abs(alpha - sample.alpha)
+                error = ray_errors(ghost, ray, sample, pixels)
                 dr.scatter_reduce(dr.ReduceOp.Add, total, error, hollow, deeper)
             dr.eval(sums)
     return np.stack([total.numpy() for total in sums])

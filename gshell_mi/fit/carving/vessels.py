@@ -19,7 +19,6 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from ... import losses
 from ...lattice import Lattice
 from ...topology import equal_patches
 from ...views import PinholeViews
@@ -28,7 +27,7 @@ from ..ghost.ghost_template import GhostTemplate, ghost_template
 from ..ghost.opening import msdf_from_template, splat_to_lattice
 from ..ghost.pixels import PixelPool
 from ..ghost.radiance_ghost import RadianceGhost
-from .fitted_ghost import fitted_ghost
+from .fitted_ghost import fitted_ghost, ray_errors
 from .hollows import carved_fields
 
 #: Thickness of a wall, in cells, that tells vessels; those that are tried for them then.
@@ -216,7 +215,6 @@ class _Trials:
         pixels, config = self.unknown, self.config
         errors, rays = (dr.zeros(mi.Float, len(self.template.vertices)) for _ in range(2))
         vertex = mi.UInt32(self.template.faces[:, 0].astype(np.uint32))
-        coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0))
         with dr.suspend_grad():
             for step in range(_ERROR_STEPS):
                 sample = pixels.sample(config.ghost_batch, seed=config.seed, step=step)
@@ -225,9 +223,7 @@ class _Trials:
                 # On a GPU, a kernel traces rays in one scene only.
                 dr.eval(hit)
                 first = dr.gather(mi.UInt32, vertex, hit.prim_index, hit.is_valid())
-                radiance, alpha = ghost.see(ray)
-                error = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
-                error = error.x + error.y + error.z + coverage * dr.abs(alpha - sample.alpha)
+                error = ray_errors(ghost, ray, sample, pixels)
                 for total, values in ((errors, error), (rays, mi.Float(1))):
                     dr.scatter_reduce(dr.ReduceOp.Add, total, values, first, hit.is_valid())
                 dr.eval(errors, rays)
