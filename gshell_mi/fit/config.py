@@ -94,7 +94,8 @@ class FitConfig:
     ghost_rounds: int = 3
     """How often, at most, the ghost is trained again for what wrong openings have hidden."""
     ghost_min_area: float = 0.005
-    """Holes and islands smaller than this fraction of the template's area are noise and are undone."""
+    """Holes smaller than this fraction of the template's area are noise and are undone, and islands smaller
+    than this fraction of the surface's."""
 
     # --- carving: folds and hollows that the hull bridges
     vessel_gain: float = 0.75
@@ -180,7 +181,7 @@ class FitConfig:
     """Fraction of the steps after which openings grow where what is behind the surface beside them explains
     the images about as well, and small ones are shut that explain them badly; 1 leaves it out. Only if
     --field is explicit."""
-    second_look_gain: float = 2.0
+    second_look_gain: float = 3.0
     """Such a change stays if, after half of the remaining steps, the squared image error there is below this
     multiple of what it was, times what the rest of the surface has gained meanwhile. Above 1, as colours were
     fitted to a cap for longer than anything was to what is behind it."""

@@ -65,7 +65,7 @@ def recast(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: np
         faces: (F, 3) of the template.
         logits: (V,) surface where positive, open elsewhere.
         radiance: (V, 3).
-        min_area: smaller cuts and islands, as a fraction of the template's area, are undone.
+        min_area: cuts and islands that are undone, as of ``clean_opacity``.
         wanted: what the surface is to be like. Where rims meet that have moved, a bridge closes and it has
             more boundary loops.
         fewest_loops: so few boundary loops will do; by default as many as are wanted.

@@ -77,7 +77,7 @@ def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: f
         faces: (F, 3) of the watertight template, oriented outwards.
         cell: side of a lattice cell, in the positions' unit.
         sheet_thickness: median thickness, in cells, up to which a part without an opening is a sheet.
-        min_area: smaller cuts and islands, as a fraction of the template's area, are undone.
+        min_area: cuts and islands that are undone, as of ``clean_opacity``.
     """
     solid = cut.logits > 0
     thickness, opposite = opposite_sides(before, cut.positions, faces, cell)

@@ -31,7 +31,8 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
     Args:
         logits: (V,) opacity logits; surface where positive.
         vertices, faces: the template.
-        min_area: connected patches of one sign smaller than this fraction of the template's area flip. A side
+        min_area: connected patches of one sign flip: cuts smaller than this fraction of the template's area,
+            and islands smaller than this fraction of the surface's, which for a sheet is half of that. A side
             of a piece that is apart from the rest counts as the whole piece.
 
     Returns:
@@ -47,7 +48,8 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
         patch = equal_patches(solid, faces)
         patch_area = np.bincount(patch, area)[patch]
         patch_area = np.where(patch_area > _SIDE * piece_area, piece_area, patch_area)
-        small = patch_area < min_area * area.sum()
+        whole = area[solid].sum() if flip_closed else area.sum()
+        small = patch_area < min_area * whole
         flip = small & (solid == flip_closed)
         cleaned[flip] = -cleaned[flip]
     return cleaned

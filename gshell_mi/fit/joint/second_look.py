@@ -125,9 +125,8 @@ class SecondLook:
         if self._changes < self.joint.config.iterations:
             template, vertices, faces, values = self._template()
             opened = self._openings(vertices, faces, values)
-            side = self._sheet_sides(template, vertices, faces, opened)
             if opened.any():
-                self._write(template, -self._scale, side)
+                self._open_sides(template, vertices, faces, opened)
         # Last of all: looking at the template brings the specks back.
         self.joint.finish()
         return changed
@@ -167,19 +166,21 @@ class SecondLook:
         before = values <= 0
         if before.all() or not before.any():
             return
-        side = self._sheet_sides(template, vertices, faces, before)
-        values, before = np.where(side, -self._scale, values), before | side
+        # First of all: while a sheet has both sides, either looks as if the images could do without it.
+        if self._open_sides(template, vertices, faces, before).any():
+            template, vertices, faces, values = self._template()
+            values = self._cleaned(vertices, faces, values)
+            before = values <= 0
         found = self._explained(template, iteration)
         smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
         shut = doubtful(values, vertices, faces, found)
         grows = near_openings(np.where(shut, self._scale, values), vertices, faces, found, smooth,
                               self._reach) & ~before
         if not (grows | shut).any():
-            self._write(template, values, side)
             return
         changed, near = reopened(values, (before | grows) & ~shut, smooth, self._scale)
         former = self._msdf()
-        msdf = self._write(template, changed, near | side)
+        msdf = self._write(template, changed, near)
         self.joint.geometry.held = (msdf < -_CORE * self._scale) & (msdf != former)
         patch = np.full(len(vertices), -1)
         place = equal_patches(np.where(grows, 1, np.where(shut, 2, 0)), faces)
@@ -214,18 +215,17 @@ class SecondLook:
         back = (patch >= 0) & kept[patch] & (self._state[f"{_PREFIX}values"][nearest] <= 0)
         part = mesh_components(faces, len(vertices))
         elsewhere = 2 * np.bincount(part, back) < np.bincount(part)
-        side = self._sheet_sides(template, vertices, faces,
-                                 elsewhere[part] | self._openings(vertices, faces, values))
-        self._write(template, -self._scale, side)
+        side = self._open_sides(template, vertices, faces,
+                                elsewhere[part] | self._openings(vertices, faces, values))
         for sheet in np.unique(part[side]):
             owner = np.bincount(patch[back & (part == sheet)]).argmax()
             self._state[f"{_PREFIX}spent"][owner] -= (1, 0)
         # From here on these are openings like those from before.
         self._state[f"{_PREFIX}patch"][nearest[side]] = -1
 
-    def _sheet_sides(self, template: SurfaceMesh, vertices: np.ndarray, faces: np.ndarray,
-                     others: np.ndarray) -> np.ndarray:
-        """(V,) one side of each small part without the others (V,) that is a closed sheet.
+    def _open_sides(self, template: SurfaceMesh, vertices: np.ndarray, faces: np.ndarray,
+                    others: np.ndarray) -> np.ndarray:
+        """Opens one side (V,) of each small part without the others (V,) that is a closed sheet.
 
         What it borders of them must be small beside it, as a neck that has been cut, by which the template
         joins it to more than itself.
@@ -239,8 +239,13 @@ class SecondLook:
         # Any flat piece has twice that rim or more.
         left_out = ((area > _SMALL * whole) | (rim**2 >= np.pi * area))[part]
         left_out |= np.bincount(faces.ravel(), minlength=len(vertices)) == 0
-        return small_sheets(vertices, template.vertex_normals().numpy().T, faces, left_out,
+        side = small_sheets(vertices, template.vertex_normals().numpy().T, faces, left_out,
                             _SHEET * self.joint.subject.cell_size)[0]
+        if side.any():
+            # Both sides hang on the same vertices of the lattice: without the other, it would open too.
+            sheet = np.isin(part, part[side])
+            self._write(template, np.where(side, -self._scale, self._scale), sheet)
+        return side
 
     def _undo(self, chosen: np.ndarray) -> None:
         """Gives those patches that are chosen (P,) what they had before."""

@@ -34,6 +34,14 @@ def test_large_patches_stay(ball):
     np.testing.assert_array_equal(clean_opacity(logits, ball.vertices, ball.faces, min_area=0.02), logits)
 
 
+def test_islands_are_measured_by_the_surface(ball):
+    """Of a sheet half of the template is open; an island of it has but one side."""
+    island = cap(ball, [0, 0, 1], 0.013)
+    logits = np.where(cap(ball, [0, 0, 1], 0.5) & ~island, -1.0, 1.0)
+    np.testing.assert_array_equal(clean_opacity(logits, ball.vertices, ball.faces, min_area=0.02), logits)
+    assert (clean_opacity(logits, ball.vertices, ball.faces, min_area=0.03)[island] < 0).all()
+
+
 def test_an_island_in_a_small_cut_is_just_surface(ball):
     logits = np.where(cap(ball, [0, 0, 1], 0.015) & ~cap(ball, [0, 0, 1], 0.004), -1.0, 1.0)
     assert (clean_opacity(logits, ball.vertices, ball.faces, min_area=0.02) > 0).all()

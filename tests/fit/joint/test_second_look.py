@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 from cap import cap
 
 from gshell_mi.fields import sphere
@@ -272,11 +273,12 @@ def test_a_doubtful_opening_stays_shut_if_the_images_are_explained_better(eviden
     assert joint.loops() == (1 if later < 1 else 2)
 
 
-def ball_and_disc(thickness: float, msdf: float) -> StillJoint:
-    """An open ball, and beside it a loose part, a disc or a drum so many cells thick, with that mSDF."""
+def ball_and_disc(thickness: float, msdf: float, place: float = 0.65) -> StillJoint:
+    """An open ball, and beside it, at a place on x, a loose part with that mSDF: a disc or a drum so many cells
+    thick."""
     joint, (x, y, z) = StillJoint(CONFIG), LATTICE.vertex_positions().T
     disc = np.maximum(np.hypot(y, z) - 4.5 * LATTICE.spacing,
-                      np.abs(x - 0.65) - thickness / 2 * LATTICE.spacing)
+                      np.abs(x - place) - thickness / 2 * LATTICE.spacing)
     ball = np.linalg.norm([x + 0.35, y, z], axis=0) - RADIUS
     joint.subject.set_fields(replace(joint.subject.fields(), sdf=np.minimum(disc, ball).astype(np.float32)))
     joint.geometry.replace("msdf", mi.Float(np.where(x > 0.3, msdf, 0.45 - z).astype(np.float32)))
@@ -311,6 +313,19 @@ def test_a_loose_sheet_has_one_side(evidence_above, monkeypatch, thickness, loop
     assert joint.loops() == loops
     assert (joint.height() < 0.3) == grows
     assert joint.geometry.held is None
+
+
+@pytest.mark.parametrize("thickness", [0.6, 1.0])
+def test_the_side_of_a_thin_sheet_that_stays_is_whole(evidence_above, monkeypatch, thickness):
+    """Both sides hang on one layer of the lattice's vertices; the mSDF is small, as after many steps."""
+    monkeypatch.setattr(second_look, "_SMALL", 0.8)
+    evidence_above |= {"empty": 0.1}
+    joint = ball_and_disc(thickness, 0.1 * LATTICE.spacing, place=0.7)
+    run(joint, range(8)).finish()
+    vertices, faces, _ = joint.subject.surface.to_numpy()
+    disc = faces[vertices[faces][:, :, 0].mean(axis=1) > 0.3]
+    area = trimesh.Trimesh(vertices, disc, process=False).area
+    assert area == pytest.approx(np.pi * (4.5 * LATTICE.spacing) ** 2, rel=0.3)
 
 
 @pytest.mark.parametrize("neck", [False, True])
