@@ -13,6 +13,7 @@ from .topology import topology, vertex_components
 from .triangles import area_vectors, unit
 from .views import PinholeViews
 from .visibility import best_view
+from .wording import counted
 
 #: A piece of less than this fraction of the surface's area is a floater.
 FLOATER = 0.02
@@ -48,14 +49,15 @@ class Diagnostics:
         if not self.pieces:
             found.append("no surface is left: look at views/, and check cameras and masks.")
         if self.floaters:
-            found.append(f"{_count(self.floaters, 'loose piece')} of less than 2 % of the area: raise "
+            found.append(f"{counted(self.floaters, 'loose piece')} of less than 2 % of the area: raise "
                          f"--ghost-min-area, or --sdf-sign to 0.002, or delete in Blender.")
         if self.pieces > 1:
             found.append(f"the surface is in {self.pieces} pieces: if the object is in one, its thin parts "
                          f"were lost; raise --resolution.")
         if self.pinholes:
-            found.append(f"{_count(self.pinholes, 'pin-hole')} beside {self.boundary_loops} boundary loops: "
-                         f"raise --hole-closing to 1, or --ghost-min-area.")
+            found.append(f"{counted(self.pinholes, 'pin-hole')} beside "
+                         f"{counted(self.boundary_loops, 'boundary loop')}: raise --hole-closing to 1, or "
+                         f"--ghost-min-area.")
         if self.self_contact > CONTACT_LIMIT:
             found.append(f"{100 * self.self_contact:.0f} % of the surface is within a cell of another sheet "
                          f"of its template, where details merge: raise --resolution.")
@@ -126,7 +128,3 @@ def _touching(centers: np.ndarray, normals: np.ndarray, template: tuple[np.ndarr
 
 def _vectors(kind: type, rows: np.ndarray):
     return kind(np.ascontiguousarray(rows.T, np.float32))
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'s' if number > 1 else ''}"

@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from ..command_line import run_command
+from ..wording import counted
 from .config import FitConfig, default_output
 
 
@@ -68,7 +69,8 @@ def _fit(given: _Arguments) -> None:
                            report=not (given.no_report or given.preview), quiet=given.quiet, observer=viewer)
     counts = result.metrics["counts"]
     print(f"{result.output}: {counts['vertices']} vertices, {counts['faces']} faces, "
-          f"{counts['boundary_loops']} boundary loops, {counts['components']} components, "
+          f"{counted(counts['boundary_loops'], 'boundary loop')}, "
+          f"{counted(counts['components'], 'component')}, "
           f"{result.metrics['psnr_training']:.2f} dB on the training views, "
           f"{result.metrics['seconds']['total']:.0f} s")
 

@@ -21,6 +21,7 @@ from ..export.asset import write_asset
 from ..files import replacing
 from ..images import srgb
 from ..turntable import TurntableConfig, render_turntable, write_video
+from ..wording import counted
 from .curves import curves
 from .viewer_model import viewer_model
 
@@ -65,6 +66,7 @@ def write_report(folder: Path, config: ReportConfig | None = None) -> Path:
     page = files(__package__) / "page"
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
                                      lstrip_blocks=True)
+    environment.filters["counted"] = counted
     template = environment.from_string((page / "report.html.j2").read_text())
     library = (page / "model-viewer.min.js").read_text().rpartition("//# sourceMappingURL")[0]
     text = template.render(

@@ -274,8 +274,8 @@ def test_a_doubtful_opening_stays_shut_if_the_images_are_explained_better(eviden
 
 
 def ball_and_disc(thickness: float, msdf: float, place: float = 0.65) -> StillJoint:
-    """An open ball, and beside it, at a place on x, a loose part with that mSDF: a disc or a drum so many cells
-    thick."""
+    """An open ball, and beside it, at a place on x, a loose part with that mSDF: a disc or a drum so many
+    cells thick."""
     joint, (x, y, z) = StillJoint(CONFIG), LATTICE.vertex_positions().T
     disc = np.maximum(np.hypot(y, z) - 4.5 * LATTICE.spacing,
                       np.abs(x - place) - thickness / 2 * LATTICE.spacing)
