@@ -135,7 +135,10 @@ class RadianceGhost:
         self._set_opacity(np.where(opaque, _CERTAIN_LOGIT, -_CERTAIN_LOGIT))
         self._opacity_rests = True
         for step in range(_REFIT_STEPS):
-            sample, radiance, _, _ = self._render(_EXTRA_STEP + step)
+            sample, radiance, _, sheets = self._render(_EXTRA_STEP + step)
+            # What is left of a template may be too small for any ray to meet.
+            if not sheets:
+                continue
             dr.backward(losses.l1(self._tone(radiance), self._tone(sample.radiance)))
             self.update(("radiance",), self.config.ghost_lr)
 

@@ -87,6 +87,14 @@ def test_a_miss_is_transparent(sheets):
     assert alpha == 0 and not radiance.any()
 
 
+def test_what_no_ray_meets_keeps_its_radiance():
+    vertices, faces = two_sheets()
+    ghost = RadianceGhost(vertices - [0, 0, 5], faces, *unused_views(), CONFIG)
+    before = ghost.radiance()
+    ghost.refit(np.ones(len(vertices), bool))
+    np.testing.assert_array_equal(ghost.radiance(), before)
+
+
 def test_only_the_first_sheets_count():
     ghost = RadianceGhost(*two_sheets(), *unused_views(), dataclasses.replace(CONFIG, ghost_sheets=1))
     _, alpha = composite(ghost, [0.1, 0.2, 5], [0, 0, -1])
