@@ -83,7 +83,8 @@ def test_a_network_goes_on_as_if_nothing_had_been(scene, tmp_path, monkeypatch):
         (step["stage"], step["iteration"]) for step in log(whole)]
     meshes = [trimesh.load(folder / "mesh.ply", process=False) for folder in (whole, stopped)]
     assert abs(len(meshes[0].vertices) - len(meshes[1].vertices)) < 20
-    assert meshes[0].area == pytest.approx(meshes[1].area, rel=2e-3)
+    # Equal runs differ by 0.3 %, as additions have no fixed order; without the optimiser's state it is 1 %.
+    assert meshes[0].area == pytest.approx(meshes[1].area, rel=6e-3)
 
 
 def test_an_unknown_field_is_refused(scene, tmp_path, capsys):
