@@ -123,10 +123,7 @@ class SecondLook:
         """
         changed = self._settle()
         if self._changes < self.joint.config.iterations:
-            template, vertices, faces, values = self._template()
-            opened = self._openings(vertices, faces, values)
-            if opened.any():
-                self._open_sides(template, vertices, faces, opened)
+            self._open_loose_sheets()
         # Last of all: looking at the template brings the specks back.
         self.joint.finish()
         return changed
@@ -160,17 +157,14 @@ class SecondLook:
         return True
 
     def _change(self, iteration: int) -> None:
+        # First of all: while a sheet has both sides, either looks as if the images could do without it.
+        self._open_loose_sheets()
         template, vertices, faces, values = self._template()
         # Specks would grow into openings of their own, apart from the one that they belong to.
         values = self._cleaned(vertices, faces, values)
         before = values <= 0
         if before.all() or not before.any():
             return
-        # First of all: while a sheet has both sides, either looks as if the images could do without it.
-        if self._open_sides(template, vertices, faces, before).any():
-            template, vertices, faces, values = self._template()
-            values = self._cleaned(vertices, faces, values)
-            before = values <= 0
         found = self._explained(template, iteration)
         smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
         shut = doubtful(values, vertices, faces, found)
@@ -207,6 +201,13 @@ class SecondLook:
         self._state[f"{_PREFIX}kept"] = ~unjustified
         self._open_sheets(~unjustified)
         self._join(~unjustified)
+
+    def _open_loose_sheets(self) -> None:
+        """Opens one side of each small part that is a closed sheet, unless the whole surface is closed."""
+        template, vertices, faces, values = self._template()
+        opened = self._openings(vertices, faces, values)
+        if opened.any() and not opened.all():
+            self._open_sides(template, vertices, faces, opened)
 
     def _open_sheets(self, kept: np.ndarray) -> None:
         """Opens one side of the sheets among the loose parts that have come back in kept patches (P,)."""
