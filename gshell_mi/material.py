@@ -107,10 +107,16 @@ def given_material(bsdf: mi.BSDF) -> dict:
     return found
 
 
-def principled() -> dict:
-    """A two-sided principled BSDF that reads the mesh's attributes, for ``mi.load_dict``."""
+def principled(base_color: mi.Texture | None = None) -> dict:
+    """A two-sided principled BSDF that reads the mesh's attributes, for ``mi.load_dict``.
+
+    Args:
+        base_color: another texture for the base colour.
+    """
     textures = {parameter: {"type": "mesh_attribute", "name": attribute}
                 for attribute, parameter in ATTRIBUTES.items()}
+    if base_color is not None:
+        textures["base_color"] = base_color
     return {"type": "twosided", "bsdf": {"type": "principled", **textures}}
 
 

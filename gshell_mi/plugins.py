@@ -13,6 +13,7 @@ import mitsuba as mi
 #: Modules that define a plugin class at import and register it with Mitsuba.
 PLUGIN_MODULES = (
     "gshell_mi.shape",
+    "gshell_mi.texture",
     "gshell_mi.integrators.gshell_path",
     "gshell_mi.integrators.gshell_mask",
 )

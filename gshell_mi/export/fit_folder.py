@@ -8,17 +8,21 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
+import trimesh
 
 from ..files import replacing
 from ..images import over_white, psnr, triptych, write_png
 from ..topology import topology
+from ..triangles import unit
 from .ply import write_ply
 from .slivers import without_slivers
 from .stock_scene import MAX_DEPTH, write_light, write_scene
 
 if TYPE_CHECKING:
+    from ..color_detail import ColorDetail
     from ..extraction import SurfaceMesh
     from ..light import EnvironmentLight
     from ..material import GivenMaterial, MaterialField
@@ -28,13 +32,14 @@ _EXPORT_SPP = 32
 
 
 def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMaterial,
-               light: EnvironmentLight | None, views: int) -> dict:
+               light: EnvironmentLight | None, views: int, detail: ColorDetail | None = None) -> dict:
     """Writes meshes, light, scene and triptychs.
 
     Args:
         fit: its subject is the result.
         light: None if it is the scene's own.
         views: how many, spread evenly, are rendered.
+        detail: of the base colour. Triangles are split in four, so that their vertices hold it.
 
     Returns:
         The metrics, which ``write_metrics`` stores.
@@ -45,7 +50,7 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
         channels = 3 if name == "vertex_color" else 1
         values = np.array(surface.interpolate(field, channels).numpy())
         attributes[name] = values.T if channels == 3 else values
-    _write_surface(output / "mesh.ply", surface, attributes)
+    _write_surface(output / "mesh.ply", surface, attributes, detail)
     template = fit.subject.template()
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
     write_light(output / "light.exr", fit.light, light)
@@ -71,10 +76,20 @@ def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dic
     return metrics
 
 
-def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.ndarray]) -> None:
+def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.ndarray],
+                   detail: ColorDetail | None = None) -> None:
     vertices, faces, _ = surface.to_numpy()
     normals = np.array(surface.vertex_normals().numpy()).T.reshape(-1, 3)
-    write_ply(path, without_slivers(vertices, faces, normals), faces, normals, attributes)
+    vertices = without_slivers(vertices, faces, normals)
+    if detail and len(faces):
+        vertices, faces, values = trimesh.remesh.subdivide(vertices, faces, vertex_attributes={
+            "normal": normals} | attributes)
+        normals, attributes = unit(values.pop("normal")), values
+        color = mi.Color3f(np.ascontiguousarray(attributes["vertex_color"].T, np.float32))
+        point = mi.Point3f(np.ascontiguousarray(vertices.T, np.float32))
+        with dr.suspend_grad():
+            attributes["vertex_color"] = detail.color(color, point).numpy().T
+    write_ply(path, vertices, faces, normals, attributes)
 
 
 def _write_views(output: Path, fit: FitScene, count: int) -> dict[str, float]:

@@ -23,7 +23,8 @@ _CALMER = 0.3
 
 #: What ``--preview`` has instead: less of everything, but for the steps that openings need.
 _PREVIEW = {"resolution": 48, "ghost_iterations": 600, "ghost_batch": 16384, "ghost_rounds": 0,
-            "carving_iterations": 0, "refinement_iterations": 0, "iterations": 70, "step_views": 1,
+            "carving_iterations": 0, "refinement_iterations": 0,
+            "volume_iterations": 0, "iterations": 70, "step_views": 1,
             "primal_spp": 4, "max_depth": 2, "color_hold": 0, "even_start": False, "light_height": 16,
             "second_look": 1, "triptychs": 4}
 
@@ -142,6 +143,27 @@ class FitConfig:
     """The second round is kept if it brings the image error of unseen views below this fraction: it hollows
     out pleats, but smooth surfaces without texture drift."""
 
+    # --- radiance volume: another start, for what no hull shows
+    volume_iterations: int = 700
+    """Steps of the radiance volume whose surface the joint stage starts from if it explains unseen views
+    better; 0 leaves it out."""
+    volume_side: int = 256
+    """Voxels per side of its last level."""
+    volume_resolution: int = 128
+    """Cells per side of the lattice, at least, if the fit starts from it."""
+    volume_batch: int = 131072
+    """Rays per step over all pixels, of which those far from the masks are left out."""
+    volume_density_lr: float = 0.3
+    """Adam's step for the logits of the densities; falls tenfold over the last level."""
+    volume_radiance_lr: float = 0.03
+    """Adam's step for the radiance, as a fraction of the targets' mean."""
+    volume_direction_lr: float = 0.03
+    """The same for what depends on the direction."""
+    volume_mask: float = 1.0
+    """Weight of the coverage's squared error beside that of the radiance."""
+    volume_distortion: float = 0.01
+    """Weight of how far apart along a ray is what it sees, in lengths of the lattice's cube."""
+
     sheet_thickness: float = 0.5
     """Closed parts that are at most so thick, in cells, come out as a single open sheet; 0 keeps both sides
     of every sheet, beside openings too."""
@@ -199,6 +221,9 @@ class FitConfig:
     """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
     material_gradient_smoothing: float = 1.0
     """Lambda of the material's Sobolev gradient on the lattice; spreads colour to what few pixels see."""
+    color_voxels: int = 0
+    """Voxels per cell of the last lattice that the base colour has around the surface, which makes it as fine
+    as the images; 0 leaves it to the lattice's vertices."""
     material_lr: float = 0.2
     """Adam's step for base colour, roughness and metallic (logits)."""
     color_hold: float = 0.5

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import trimesh
 
 from ..errors import UserError
 from ..export import check_output_folder, export_fit, make_output_folder, write_metrics
@@ -32,7 +33,7 @@ from .bookkeeping.interrupt import Interrupt
 from .bookkeeping.observer import Observer
 from .bookkeeping.progress import Progress
 from .carving.carving import carve
-from .carving.radiance_volume import RadianceVolume
+from .carving.radiance_volume import RadianceVolume as Fog
 from .carving.vessels import hollowed_vessels
 from .config import FitConfig, default_output
 from .cut.recast import recast
@@ -48,7 +49,10 @@ from .joint.depth import check_depth
 from .joint.field_fitting import FieldFitting
 from .joint.joint import JointStage
 from .joint.second_look import SecondLook
+from .judge import judge
 from .memory import MemoryEstimate
+from .radiance.volume import RadianceVolume
+from .radiance.volume_surface import volume_surface
 from .refinement.rounds import Moved, RefinementRounds
 from .start import (
     EARLY_GRIDS,
@@ -66,6 +70,9 @@ _SURFACE = ("sdf", "msdf", "radiance", "known")
 
 #: Every eighth view is kept from the refinement and judges it.
 _HOLD_OUT = 8
+
+#: Pixels this near to a mask's outline do not judge a start: where a surface ends to a cell is found later.
+_OUTLINE = 3
 
 
 @dataclass(frozen=True)
@@ -157,11 +164,13 @@ class _Fit:
                 self._carve()
             if self.checkpoint.stage in ("refinement", "folds"):
                 self._refine()
+            if self.checkpoint.stage == "volume":
+                self._volume()
             joint = self._joint()
             self.interrupt.check()
             with self.progress.stage("export", None), self.books.timed("export"):
                 metrics = export_fit(self.output, self.scene, joint.material, joint.light,
-                                     self.config.triptychs)
+                                     self.config.triptychs, joint.detail)
                 metrics["config"] = _plain(self.config)
                 metrics |= findings(self.scene, self.views, joint.scene, self.progress.warn)
             metrics = self._write_metrics(metrics)
@@ -265,7 +274,7 @@ class _Fit:
         state = self.checkpoint.arrays
         if cubes and count:
             _, vertices, faces = closed_template(self.scene.subject, state["hull"], self.lattice)
-            volume = RadianceVolume(state["hull"].reshape((self.lattice.stride,) * 3), vertices, faces,
+            volume = Fog(state["hull"].reshape((self.lattice.stride,) * 3), vertices, faces,
                                     self.scene.subject.to_world, self.views, known, self.config,
                                     self.checkpoint.iteration)
             self.books.iterate("carving", count, volume, volume.optimizers, state)
@@ -305,7 +314,55 @@ class _Fit:
         facts["refinement_kept"] = taken != "start"
         if rounds and self.config.folds_iterations:
             facts["folds_kept"] = taken == "folds"
-        self.books.enter("joint", **found | self._without_unseen(found), light=state["light"])
+        volume = self.config.volume_iterations and not self.scene.subject.filename
+        self.books.enter("volume" if volume else "joint", **found | self._without_unseen(found),
+                         light=state["light"])
+
+    def _volume(self) -> None:
+        """Starts the joint stage from the surface of a radiance volume if unseen views tell for it."""
+        state, subject, config = self.checkpoint.arrays, self.scene.subject, self.config
+        known, _ = self._split_pixels()
+        subject.set_fields(self._fields(state))
+        surface = subject.surface.to_numpy()[:2]
+        volume = self._radiance_volume(state, known, surface)
+        self.books.iterate("volume", config.volume_iterations, volume, volume.optimizers, state,
+                           volume.arrays)
+        with self.progress.stage("depth maps", len(self.views)) as advance, self.books.timed("volume"):
+            lattice = self._volume_lattice()
+            found = volume_surface(volume, self.scene, lattice, advance)
+            moved = found and Moved("volume", found.positions, found.radiance, np.inf)
+            fields = found and self._recast(found.template, moved)
+        kept = {name: state[name] for name in _SURFACE} | {"light": state["light"]}
+        if fields:
+            with self.progress.stage("verdict", None), self.books.timed("volume"):
+                unknown = PixelPool(self.views, self.scene.targets, self._held_out(), _OUTLINE)
+                subject.set_fields(self._fields(fields))
+                verdict = judge(_as_fine(surface, subject.cell_size), subject.surface.to_numpy()[:2],
+                                self.views, known, unknown, config)
+            self.checkpoint.facts["volume"] = dataclasses.asdict(verdict)
+            self.checkpoint.facts["volume_kept"] = verdict.accepted
+            if verdict.accepted:
+                kept |= fields | self._without_unseen(fields)
+        self.books.enter("joint", **kept)
+
+    def _radiance_volume(self, state: Mapping[str, np.ndarray], known: PixelPool,
+                         surface: tuple[np.ndarray, np.ndarray]) -> RadianceVolume:
+        """A radiance volume inside the visual hull, or that of the checkpoint."""
+        side, subject = RadianceVolume.first_side(self.config), self.scene.subject
+        centre = (np.arange(side, dtype=np.float32) + 0.5) * (2 / side) - 1
+        z, y, x = (axis.ravel() for axis in np.meshgrid(centre, centre, centre, indexing="ij"))
+        points = mi.Transform4f(subject.to_world) @ mi.Point3f(x, y, z)
+        hull = visual_hull(points, self.views, [target.rgba[..., 3] for target in self.scene.targets])
+        hull = np.clip(hull.numpy() / subject.length_scale, -1, 1).reshape((side,) * 3)
+        return RadianceVolume(hull, subject.to_world, self.views, known, self.config, surface, state)
+
+    def _volume_lattice(self) -> Lattice:
+        last = self.last_lattice
+        return make_lattice(last.grid, max(last.resolution, self.config.volume_resolution))
+
+    def _fields(self, arrays: Mapping[str, np.ndarray]) -> LatticeFields:
+        closed = LatticeFields.closed(arrays["sdf"], self.last_lattice.grid)
+        return dataclasses.replace(closed, msdf=arrays["msdf"])
 
     def _recast(self, template: GhostTemplate, moved: Moved) -> dict[str, np.ndarray] | None:
         """Fields of a moved template, cut as well as can be; None if no cut comes out whole, or it has not
@@ -342,14 +399,19 @@ class _Fit:
 
     def _split_pixels(self) -> tuple[PixelPool, PixelPool]:
         """Pixels to learn the shape from, and those of views kept apart to judge it."""
-        every = np.arange(len(self.views))
-        held_out = every[::_HOLD_OUT]
+        every, held_out = np.arange(len(self.views)), self._held_out()
         seen = np.setdiff1d(every, held_out) if len(every) > 1 else every
         known, unknown = (PixelPool(self.views, self.scene.targets, chosen) for chosen in (seen, held_out))
         return known, unknown
 
+    def _held_out(self) -> np.ndarray:
+        """The views kept apart to judge."""
+        return np.arange(len(self.views))[::_HOLD_OUT]
+
     def _joint(self) -> JointStage:
         """The joint stage on the lattice that the fit ends on; on a coarser one first, if there is one."""
+        if self.checkpoint.facts.get("volume_kept"):
+            self.last_lattice = self.joint_lattice = self._volume_lattice()
         if self.joint_lattice == self.last_lattice:
             return self._joint_stage("joint", self.last_lattice, self.config).joint
         if self.checkpoint.stage in ("field", "joint"):
@@ -363,12 +425,16 @@ class _Fit:
         fields = start_fields(self.scene.subject, start, lattice, config)
         self.scene.subject.set_fields(fields)
         joint = JointStage(self.scene, start_material(self.scene, start, fields.lattice, config),
-                           start_light(self.scene, start, config), config)
+                           start_light(self.scene, start, config), config,
+                           config.color_voxels * self.last_lattice.resolution)
+        if joint.detail and "detail_places" in start:
+            joint.restore_detail(start)
         self._fit_field(joint)
         look = SecondLook(joint, self.views, self.pixels, self.checkpoint.arrays)
         if self.checkpoint.stage == name:
             self.books.iterate(name, config.iterations, look, joint.optimizers, start,
-                               lambda: look.state() | block_arrays(self.scene.subject.fields()))
+                               lambda: (look.state() | block_arrays(self.scene.subject.fields())
+                                        | joint.detail_arrays()))
         else:
             for optimizer_name, optimizer in joint.optimizers.items():
                 restore_optimizer(optimizer_name, optimizer, self.checkpoint.arrays)
@@ -411,6 +477,15 @@ class _Fit:
                 write_report(self.output)
         except UserError as error:
             self.progress.warn(str(error))
+
+
+def _as_fine(surface: tuple[np.ndarray, np.ndarray], length: float) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh whose edges are at most about as long as given: its radiance may be as fine."""
+    vertices, faces = surface
+    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+    if len(faces) and np.median(np.linalg.norm(edges, axis=-1)) > 1.5 * length:
+        return trimesh.remesh.subdivide(vertices, faces)
+    return surface
 
 
 def _plain(config: FitConfig) -> dict:

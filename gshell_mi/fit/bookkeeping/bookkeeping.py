@@ -19,7 +19,7 @@ from .observer import Observer, Preview
 from .progress import Progress
 
 #: The stages of a fit, in their order.
-STAGES = ("hull", "ghost", "carving", "refinement", "folds", "field", "joint", "detail", "done")
+STAGES = ("hull", "ghost", "carving", "refinement", "folds", "volume", "field", "joint", "detail", "done")
 
 #: Between two checkpoints at least this many times what writing one takes.
 _CHECKPOINT_PAUSE = 10

@@ -21,6 +21,9 @@ FAINT = 0.01
 #: Pixels this near to a mask are drawn, too: a template that is still to move may reach beyond it.
 _MARGIN = 3
 
+#: Pixels per side of the tiles that pixels are stored in: those that follow each other are neighbours.
+_TILE = 4
+
 
 @dataclass(frozen=True)
 class PixelSample:
@@ -48,16 +51,18 @@ class PixelPool:
         views: the cameras.
         targets: their images.
         chosen: indices of the views whose pixels are drawn; default all.
+        off_outline: leaves out pixels nearer to a mask's outline than this many pixels.
     """
 
-    def __init__(self, views: PinholeViews, targets: list[Target], chosen: np.ndarray | None = None):
+    def __init__(self, views: PinholeViews, targets: list[Target], chosen: np.ndarray | None = None,
+                 off_outline: int = 0):
         chosen = np.arange(len(views)) if chosen is None else chosen
         targets = [targets[index] for index in chosen]
-        near = [_near_object(target) for target in targets]
-        rgba = np.concatenate([target.rgba[where] for target, where in zip(targets, near, strict=True)])
+        places = [_tiled(_near_object(target) & ~_on_outline(target, off_outline)) for target in targets]
+        rgba = np.concatenate([target.rgba[*place.T] for target, place in zip(targets, places, strict=True)])
         self._pixels = mi.Float(rgba.ravel())
-        self._view = mi.UInt32(np.repeat(chosen, [np.count_nonzero(where) for where in near]))
-        row, column = np.concatenate([np.argwhere(where) for where in near]).T.astype(np.float32)
+        self._view = mi.UInt32(np.repeat(chosen, [len(place) for place in places]))
+        row, column = np.concatenate(places).T.astype(np.float32)
         self._corner = mi.Point2f(column, row)
         self._size = mi.Vector2f(views.sizes.T.astype(np.float32))
         self._count = len(row)
@@ -80,13 +85,27 @@ class PixelPool:
         """``weight``, or 0 if a target came without alpha: then coverage is unknown."""
         return weight if self.has_alpha else 0.0
 
-    def sample(self, count: int, *, seed: int, step: int) -> PixelSample:
-        """What is drawn of ``count`` pixels; the same for the same ``seed`` and ``step``."""
-        count = max(round(count * self._share), 1)
+    def sample(self, count: int, *, seed: int, step: int, rays: int = 1,
+               together: int = 1) -> PixelSample:
+        """What is drawn of ``count`` pixels; the same for the same ``seed`` and ``step``.
+
+        Args:
+            count: pixels, of which those far from the masks are left out.
+            seed, step: of the random numbers.
+            rays: positions per pixel, which follow each other.
+            together: neighbours that are drawn together; what they see is near in memory.
+        """
+        count = max(round(count * self._share / together), 1)
         # One stream per step: a resumed run draws what the uninterrupted one would have drawn.
         random = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed), initseq=_sequence(count, step))
         most = dr.opaque(mi.UInt32, self._count - 1)
         pixel = dr.minimum(mi.UInt32(random.next_float32() * dr.opaque(mi.Float, self._count)), most)
+        if rays * together > 1:
+            lane = dr.arange(mi.UInt32, count * together * rays)
+            pixel = dr.gather(mi.UInt32, pixel, lane // (rays * together)) + (lane // rays) % together
+            pixel, count = dr.minimum(pixel, most), rays * together * count
+            random = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed + 1),
+                              initseq=_sequence(count, step))
         view = dr.gather(mi.UInt32, self._view, pixel)
         corner = dr.gather(mi.Point2f, self._corner, pixel)
         film = mi.Point2f(corner + mi.Vector2f(random.next_float32(), random.next_float32()))
@@ -97,11 +116,25 @@ class PixelPool:
         return sample
 
 
+def _tiled(chosen: np.ndarray) -> np.ndarray:
+    """(n, 2) row and column of the chosen pixels, tile by tile of 4 x 4."""
+    place = np.argwhere(chosen)
+    row, column = place.T // _TILE
+    return place[np.lexsort((column, row))]
+
+
 def _near_object(target: Target) -> np.ndarray:
     """(height, width) whether a ray through a pixel may meet the visual hull, which bridges holes."""
     mask = ndimage.binary_fill_holes(target.rgba[..., 3] > FAINT)
     near = ndimage.maximum_filter(mask, 2 * _MARGIN + 1)
     return near if near.any() else np.ones_like(near)
+
+
+def _on_outline(target: Target, distance: int) -> np.ndarray:
+    """(height, width) whether a pixel is within a distance of one that the object covers otherwise."""
+    covered = target.rgba[..., 3] > 0.5
+    side = 2 * distance + 1
+    return ndimage.maximum_filter(covered, side) != ndimage.minimum_filter(covered, side)
 
 
 def _sequence(count: int, step: int) -> mi.UInt64:

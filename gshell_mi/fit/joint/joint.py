@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ... import losses
+from ...color_detail import ColorDetail, moved
 from ...errors import UserError
 from ...fields.smoothing import LatticeDiffusion
 from ...images import decibels
@@ -45,13 +48,19 @@ class JointStage:
         material: a ``GivenMaterial`` stays as it is.
         light: None keeps the scene's.
         config: settings of the stage.
+        detail_side: voxels per side of the base colour's detail; 0 for none.
     """
 
     def __init__(self, fit: FitScene, material: MaterialField | GivenMaterial, light: EnvironmentLight | None,
-                 config: FitConfig):
+                 config: FitConfig, detail_side: int = 0):
         self.fit, self.material, self.light, self.config = fit, material, light, config
         self.subject = fit.subject
-        self.subject.set_bsdf(mi.load_dict(principled()))
+        self.detail = self._color_detail(detail_side)
+        texture = None
+        if self.detail:
+            texture = mi.load_dict({"type": "gshell_color"})
+            texture.detail = self.detail
+        self.subject.set_bsdf(mi.load_dict(principled(texture)))
         for name, field in material.values().items():
             self.subject.attach_attribute(name, field)
         self.scene = optimised_scene(fit, light)
@@ -75,6 +84,10 @@ class JointStage:
         #: The lattice fields of the present step, with gradients enabled; none before the geometry moves.
         self.fields: dict[str, mi.Float] = {}
         self.material_optimizer = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
+        self.detail_optimizer = mi.ad.Adam(lr=config.material_lr)
+        if self.detail:
+            self.detail_optimizer["detail"] = self.detail.values
+            self._detail_parameter = next(name for name in self.parameters.keys() if name.endswith(".detail"))
         # What a mean over all pixels says of one texel may be smaller than the epsilon that is usual.
         self.light_optimizer = TemperedAdam(lr=config.light_lr, epsilon=1e-12,
                                             params={"log_radiance": light.log_radiance} if light else None)
@@ -83,7 +96,8 @@ class JointStage:
 
     @property
     def optimizers(self) -> dict[str, mi.ad.Adam]:
-        return self.geometry.optimizers | {"material": self.material_optimizer, "light": self.light_optimizer}
+        others = {"material": self.material_optimizer, "light": self.light_optimizer}
+        return self.geometry.optimizers | others | ({"detail": self.detail_optimizer} if self.detail else {})
 
     def step(self, iteration: int) -> dict[str, float]:
         """One step on ``step_views`` views; returns the losses.
@@ -107,7 +121,7 @@ class JointStage:
             compute(total)
         with phase("backward") as compute:
             dr.backward(total)
-            sought = (self.fields, self.material_optimizer, self.light_optimizer)
+            sought = (self.fields, self.material_optimizer, self.light_optimizer, self.detail_optimizer)
             compute(*(dr.grad(value) for values in sought for value in values.values()))
         progress = iteration / max(config.iterations, 1)
         with phase("optimiser"):
@@ -142,6 +156,7 @@ class JointStage:
         fields = self.subject.fields()
         arrays = {"sdf": fields.sdf, "msdf": fields.msdf, "deform": fields.deform}
         arrays |= {name: field.numpy() for name, field in self.material.parameters.items()}
+        arrays |= self.detail_arrays()
         return arrays | ({"log_radiance": self.light.log_radiance.numpy()} if self.light else {})
 
     def preview(self) -> Preview:
@@ -188,6 +203,9 @@ class JointStage:
         self.material.parameters = {name: self.material_optimizer[name] for name in self.material.parameters}
         for name, field in self.material.values().items():
             self.parameters[f"subject.lattice_{name}"] = field
+        if self.detail:
+            self.detail.values = self.detail_optimizer["detail"]
+            self.parameters[self._detail_parameter] = self.detail.values
         if self.light:
             self.light.log_radiance = self.light_optimizer["log_radiance"]
             self.light.update(self.parameters)
@@ -199,12 +217,44 @@ class JointStage:
 
     def _follow_surface(self, *, rescan: bool) -> None:
         """Moves the blocks that the fields are stored in, and all that is stored with them."""
+        if self.detail and rescan:
+            self._follow_detail()
         carried = self.subject.follow(rescan=rescan)
         if carried is None:
             return
         self.geometry.carry(carried)
         carried.optimizer(self.material_optimizer, self.material.on_lattice)
         self.material.carry(carried)
+
+    def _color_detail(self, side: int) -> ColorDetail | None:
+        """Detail around the present surface, if the material is sought."""
+        if not side or not self.material.parameters:
+            return None
+        return ColorDetail(self._local_vertices(), side, mi.Transform4f(self.subject.to_world).inverse())
+
+    def detail_arrays(self) -> dict[str, np.ndarray]:
+        """What ``restore_detail`` needs."""
+        return self.detail.arrays() if self.detail else {}
+
+    def restore_detail(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """The detail that a stage before has left."""
+        self.detail.restore(arrays)
+        self.detail_optimizer["detail"] = self.detail.values
+
+    def _local_vertices(self) -> np.ndarray:
+        """(V, 3) of the surface, in the lattice's cube."""
+        vertices = mi.Point3f(dr.detach(self.subject.surface.vertices))
+        return (mi.Transform4f(self.subject.to_world).inverse() @ vertices).numpy().T
+
+    def _follow_detail(self) -> None:
+        """Moves the detail's voxels, and what the optimiser keeps for them, to where the surface is now."""
+        self.detail.values = dr.detach(self.detail_optimizer["detail"])
+        source = self.detail.follow(self._local_vertices())
+        _, promoted, rate, (step, first, second, largest) = self.detail_optimizer.state["detail"]
+        value = self.detail.values
+        dr.enable_grad(value)
+        self.detail_optimizer.state["detail"] = (
+            value, promoted, rate, (step, moved(first, source), moved(second, source), largest))
 
     def _step_material(self, progress: float, diffuse: LatticeDiffusion) -> None:
         config, optimizer = self.config, self.material_optimizer
@@ -221,6 +271,11 @@ class JointStage:
             rates["vertex_color"] *= (progress / config.color_hold) ** 2
         optimizer.set_learning_rate(rates)
         optimizer.step()
+        if self.detail:
+            detail = self.detail_optimizer
+            dr.set_grad(detail["detail"], finite(dr.grad(detail["detail"])))
+            detail.set_learning_rate(rates["vertex_color"])
+            detail.step()
 
     def _step_light(self, progress: float) -> None:
         optimizer = self.light_optimizer

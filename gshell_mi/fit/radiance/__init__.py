@@ -1,0 +1,1 @@
+"""Radiance of what has no surface yet: what the images say before there is a material and a light."""

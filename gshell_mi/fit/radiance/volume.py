@@ -1,0 +1,259 @@
+"""A radiance volume: where is something, where is nothing?
+
+A surface that starts at the visual hull and moves locally never finds windows, struts or the gaps between
+leaves. A fog has no such start: it thins wherever the views disagree and thickens where they agree
+(Mildenhall et al., ECCV 2020; on voxels Sun et al. and Fridovich-Keil et al., CVPR 2022).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import ndimage
+
+from ...activations import inverse_softplus, sigmoid, softplus
+from ...bricks import BRICK, Bricks
+from ...images import decibels
+from ...views import PinholeViews
+from ..bookkeeping.observer import Preview
+from ..config import FitConfig
+from ..ghost.contrast import Contrast
+from ..ghost.pixels import PixelPool
+from .marching import Adjoint, Rays, composite, depth_along
+
+#: Voxels per side of each level over those of the last one, and shares of the steps.
+_SIDES, _SHARES = (0.25, 0.5, 1.0), (0.29, 0.29, 0.42)
+
+#: Neighbouring pixels that are drawn together: what they see is near in memory.
+_TOGETHER = 4
+
+#: Rays per pixel. The error of one weighs the derivative of the other, so that the noise of their random
+#: lookups is not taken for an error of the image.
+_RAYS = 2
+
+#: Optical depth of a voxel at the start, and the logit of one that is empty.
+_FOG, _EMPTY = 0.13, -10.0
+
+#: Logits at the start of a level: what was empty may fill, and what was opaque thin out.
+_LOGITS = -6.0, 6.0
+
+#: Voxels this far outside of the visual hull, in voxels of the first level, are empty.
+_OUTSIDE = 1.5
+
+#: The next level has voxels around those that give some ray this share of its light.
+_SHARE = 0.1
+
+#: Batches of rays that look for them; random numbers apart from those of the steps.
+_SURVEY, _SURVEY_STEP = 16, 1 << 20
+
+#: Fraction of what depends on the direction that a step takes away: it explains gloss, and no geometry.
+_DIRECTION_DECAY = 0.002
+
+
+class RadianceVolume:
+    """Density and radiance in sparse voxels, trained on random pixels from coarse to fine.
+
+    The radiance of a voxel is linear in the direction of the ray, but for the first level, where it does not
+    depend on it. Rays read one of the eight voxels around each sample at random, by the weights of the
+    trilinear interpolation (stochastic filtering): eight times fewer memory accesses, and the noise averages
+    out.
+
+    Args:
+        hull: (n, n, n) signed distances to the visual hull at the centres of the first level's voxels, in the
+            cube [-1, 1]^3, z by y by x.
+        to_world: from the cube to the world.
+        views: the cameras.
+        pixels: the targets' pixels.
+        config: ``volume_*`` fields.
+        surface: vertices (V, 3) and faces (F, 3) to show meanwhile, world units.
+        stored: what ``arrays`` gave, of a run to go on with.
+    """
+
+    def __init__(self, hull: np.ndarray, to_world: mi.ScalarTransform4f, views: PinholeViews,
+                 pixels: PixelPool, config: FitConfig, surface: tuple[np.ndarray, np.ndarray],
+                 stored: Mapping[str, np.ndarray] | None = None):
+        self.views, self.pixels, self.config, self.surface = views, pixels, config, surface
+        self.to_lattice = mi.Transform4f(to_world).inverse()
+        self.mean_radiance = pixels.mean_radiance()
+        self._tone = Contrast(self.mean_radiance)
+        self._hull = mi.Texture3f(mi.TensorXf(hull[..., None].astype(np.float32)),
+                                  wrap_mode=dr.WrapMode.Clamp)
+        self._reach = _OUTSIDE * 2 / len(hull)
+        self._sides = [max(BRICK, round(share * config.volume_side / BRICK) * BRICK) for share in _SIDES]
+        counts = np.round(np.multiply(_SHARES, config.volume_iterations))
+        #: The first step of each level, and the end of all.
+        self._begins = [0, *(int(step) for step in np.cumsum(counts))]
+        #: By name; another one on each level.
+        self.optimizers: dict[str, mi.ad.Adam] = {}
+        if stored and "volume_places" in stored:
+            self.level = int(stored["volume_level"])
+            self._begin(Bricks.at(stored["volume_places"], self._sides[self.level]))
+        else:
+            self.level = 0
+            near = hull < self._reach
+            m = self._sides[0] // BRICK
+            zoom = len(hull) // m
+            self._begin(Bricks.where(near.reshape(m, zoom, m, zoom, m, zoom).any(axis=(1, 3, 5))))
+
+    @staticmethod
+    def first_side(config: FitConfig) -> int:
+        """Voxels per side of the first level."""
+        return max(BRICK, round(_SIDES[0] * config.volume_side / BRICK) * BRICK)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Which voxels there are, for a run to go on with."""
+        return {"volume_places": self.bricks.places.astype(np.int16), "volume_level": np.array(self.level)}
+
+    def step(self, iteration: int) -> dict[str, float]:
+        """One Adam step; returns the losses."""
+        config = self.config
+        while self.level + 1 < len(self._sides) and iteration >= self._begins[self.level + 1]:
+            self._refine()
+        rays, target, alpha = self._rays(iteration)
+        packets = self._packets()
+        seen = composite(self.bricks, packets, rays, iteration)
+        dr.eval(seen.radiance, seen.transmittance, seen.spread)
+        dr.enable_grad(seen.radiance, seen.transmittance)
+        other = dr.arange(mi.UInt32, dr.width(alpha)) ^ 1
+        error, missing = self._tone(seen.radiance) - self._tone(target), 1 - seen.transmittance - alpha
+        image = dr.sum(dr.dot(error, dr.gather(mi.Color3f, dr.detach(error), other)))
+        mask = dr.sum(missing * dr.gather(mi.Float, dr.detach(missing), other))
+        weight = self.pixels.mask_weight(config.volume_mask)
+        dr.backward(image + weight * mask)
+        adjoint = Adjoint(dr.detach(seen.radiance), dr.detach(seen.transmittance), seen.spread,
+                          dr.grad(seen.radiance), dr.grad(seen.transmittance),
+                          dr.opaque(mi.Float, config.volume_distortion))
+        self._descend(composite(self.bricks, packets, rays, iteration, adjoint=adjoint), iteration)
+        count = max(dr.width(alpha), 1)
+        image, mask = image[0] / count, mask[0] / count
+        return {"loss": image + weight * mask, "image": image, "mask": mask,
+                "psnr": decibels(max(image / 3, 1e-9))}
+
+    def preview(self) -> Preview:
+        """The surface before: a fog has none yet."""
+        vertices, faces = self.surface
+        return Preview(vertices, faces, np.full_like(vertices, self.mean_radiance), vertices, faces)
+
+    # --- what it holds
+
+    def depth(self, view: int) -> np.ndarray:
+        """(height, width) distance along the ray through each pixel's centre, in world units, at which half
+        of the light is blocked; infinite where less ever is."""
+        width, height = (int(side) for side in self.views.sizes[view])
+        ray = self.views.pixel_rays(view)
+        found = depth_along(self.bricks, self._packets(), Rays.through(self.bricks, self.to_lattice @ ray))
+        return (found / dr.norm(self.to_lattice @ ray.d)).numpy().reshape(height, width)
+
+    def radiance_at(self, points: np.ndarray) -> np.ndarray:
+        """(V, 3) radiance at (V, 3) world positions, averaged over directions; 0 where nothing is."""
+        position = self.to_lattice @ mi.Point3f(np.ascontiguousarray(points.T, np.float32))
+        (values,) = self._resampled(position, {"radiance": 3})
+        return np.maximum(values.numpy().reshape(-1, 3), 0)
+
+    # --- levels
+
+    def _begin(self, bricks: Bricks, values: dict[str, mi.Float] | None = None) -> None:
+        self.bricks = bricks
+        count = bricks.voxel_count
+        density = dr.full(mi.Float, inverse_softplus(_FOG), count) if values is None else values["density"]
+        to_hull = self._hull.eval(mi.Point3f(0.5 * (bricks.centres() + 1)))[0]
+        outside = to_hull > dr.opaque(mi.Float, self._reach)
+        values = values or {"radiance": dr.full(mi.Float, self.mean_radiance, 3 * count),
+                            "direction": dr.zeros(mi.Float, 9 * count)}
+        self.optimizers["volume"] = mi.ad.Adam(lr=1.0, beta_2=0.99, params=values | {
+            "density": dr.select(outside, _EMPTY, density)})
+
+    def _refine(self) -> None:
+        """Goes on with voxels of half the size where something is."""
+        side = self._sides[self.level + 1]
+        shares = self.bricks.dense(self._greatest_shares())
+        live = ndimage.binary_dilation(shares > _SHARE, ndimage.generate_binary_structure(3, 3))
+        m = side // BRICK
+        size = len(live) // m
+        bricks = Bricks.where(live.reshape(m, size, m, size, m, size).any(axis=(1, 3, 5)))
+        channels = {"density": 1, "radiance": 3, "direction": 9}
+        values = dict(zip(channels, self._resampled(bricks.centres(), channels), strict=True))
+        # A voxel of half the length has half the optical depth; but what is opaque stays so.
+        values["density"] = dr.clip(values["density"], *_LOGITS)
+        self.level += 1
+        self._begin(bricks, values)
+
+    def _resampled(self, position: mi.Point3f, channels: Mapping[str, int]) -> list[mi.Float]:
+        """Parameters at positions in the cube, interpolated between the voxels that there are."""
+        optimizer = self.optimizers["volume"]
+        nearby, count = self.bricks.lookup().around(position, mi.Bool(True)), dr.width(position)
+        share = sum((weight for _, weight in nearby), mi.Float(0))
+        index, results = dr.arange(mi.UInt32, count), []
+        for name, size in channels.items():
+            flat, values = dr.empty(mi.Float, size * count), dr.detach(optimizer[name])
+            for channel in range(size):
+                total = mi.Float(0)
+                for voxel, weight in nearby:
+                    total += weight * dr.gather(mi.Float, values, voxel * size + channel)
+                dr.scatter(flat, total / dr.maximum(share, 1e-3), index * size + channel,
+                           mode=dr.ReduceMode.Permute)
+            results.append(flat)
+        dr.eval(results)
+        return results
+
+    def _greatest_shares(self) -> np.ndarray:
+        """Per voxel the greatest share of its light that it gives to a ray of the views."""
+        greatest, packets = dr.zeros(mi.Float, self.bricks.voxel_count), self._packets()
+        for batch in range(_SURVEY):
+            rays, _, _ = self._rays(_SURVEY_STEP + batch)
+            composite(self.bricks, packets, rays, _SURVEY_STEP + batch, greatest=greatest)
+            dr.eval(greatest)
+        return greatest.numpy()
+
+    # --- steps
+
+    def _rays(self, step: int) -> tuple[Rays, mi.Color3f, mi.Float]:
+        """Random pixels' rays, and the targets' radiance and coverage."""
+        sample = self.pixels.sample(self.config.volume_batch // _RAYS, seed=self.config.seed, step=step,
+                                    rays=_RAYS, together=_TOGETHER)
+        ray = self.to_lattice @ self.views.rays(sample.view, sample.film)
+        return Rays.through(self.bricks, ray, jitter=step), sample.radiance, sample.alpha
+
+    def _packets(self) -> mi.Float:
+        """What rays read: per voxel four numbers, radiance and optical depth, or 16 with the slopes of the
+        radiance along x, y and z. One voxel is one line of the cache."""
+        optimizer, voxel = self.optimizers["volume"], dr.arange(mi.UInt32, self.bricks.voxel_count)
+        width = 4 if self.level else 1
+        packets = dr.empty(mi.Float, 4 * width * self.bricks.voxel_count)
+        red, green, blue = dr.unravel(mi.Vector3f, dr.detach(optimizer["radiance"]))
+        depth = softplus(dr.detach(optimizer["density"]))
+        dr.scatter(packets, mi.Vector4f(red, green, blue, depth), width * voxel, mode=dr.ReduceMode.Permute)
+        for axis in range(width - 1):
+            slope = dr.gather(mi.Vector3f, dr.detach(optimizer["direction"]), 3 * voxel + axis)
+            dr.scatter(packets, mi.Vector4f(slope.x, slope.y, slope.z, 0), width * voxel + (axis + 1),
+                       mode=dr.ReduceMode.Permute)
+        dr.eval(packets)
+        return packets
+
+    def _descend(self, gradient: mi.Float, iteration: int) -> None:
+        """One step of Adam along the derivative by the packets."""
+        config, optimizer, count = self.config, self.optimizers["volume"], self.bricks.voxel_count
+        voxel, width = dr.arange(mi.UInt32, count), 4 if self.level else 1
+        first = dr.gather(mi.Vector4f, gradient, width * voxel)
+        dr.set_grad(optimizer["density"], sigmoid(dr.detach(optimizer["density"])) * first.w)
+        dr.set_grad(optimizer["radiance"], dr.ravel(mi.Vector3f(first.x, first.y, first.z)))
+        slopes = dr.zeros(mi.Float, 9 * count)
+        for axis in range(width - 1):
+            slope = dr.gather(mi.Vector4f, gradient, width * voxel + (axis + 1))
+            dr.scatter(slopes, mi.Vector3f(slope.x, slope.y, slope.z), 3 * voxel + axis,
+                       mode=dr.ReduceMode.Permute)
+        dr.set_grad(optimizer["direction"], slopes)
+        begin, end = self._begins[self.level : self.level + 2]
+        last = self.level == len(self._sides) - 1
+        decay = (0.1 if last else 0.5) ** ((iteration - begin) / max(end - begin, 1))
+        bright = decay * self.mean_radiance
+        optimizer.set_learning_rate({"density": decay * config.volume_density_lr,
+                                     "radiance": bright * config.volume_radiance_lr,
+                                     "direction": bright * config.volume_direction_lr if self.level else 0.0})
+        optimizer.step()
+        if self.level:
+            kept = dr.opaque(mi.Float, 1 - _DIRECTION_DECAY)
+            optimizer["direction"] = kept * dr.detach(optimizer["direction"])
