@@ -11,8 +11,8 @@ import mitsuba as mi
 
 from .compat import write_bitmap
 from .errors import UserError
-from .files import replacing
-from .targets import Target, load_target
+from .files import locked, name_trouble, remove_stale, replacing
+from .targets import Target, depth_file, load_target
 
 #: Samples per pixel of targets rendered from a scene's reference.
 REFERENCE_SPP = 128
@@ -44,6 +44,12 @@ class FitScene:
     def name(self) -> str:
         return self.path.stem
 
+    @property
+    def target_files(self) -> set[Path]:
+        """The files of the targets, depth maps included."""
+        return {file for target in self.targets for file in (target.path, depth_file(target.path))
+                if file is not None}
+
 
 def load_fit_scene(path: Path, targets: Path | None = None, *,
                    before_targets: Callable[[mi.Shape, list[mi.Sensor]], None] | None = None,
@@ -59,7 +65,8 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
 
     Raises:
         UserError: the file is missing or not a Mitsuba scene, it has not exactly one gshell shape, no
-            emitter ``light``, no sensors, sensors of the same id, or a target is missing or unusable.
+            emitter ``light`` or another one beside it, no sensors, sensors of the same id or of one that
+            cannot be a file's name, or a target is missing or unusable.
     """
     path = Path(path)
     if not path.is_file():
@@ -74,6 +81,10 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
     if repeated:
         raise UserError(f"Scene '{path}' has several sensors with the id '{repeated[0]}'; "
                         f"rename all but one.")
+    for name in (sensor.id() for sensor in sensors):
+        if trouble := name_trouble(name):
+            raise UserError(f"The id {name[:80]!r} of a sensor of scene '{path}' {trouble}; targets and "
+                            f"results are files of these names: give it one such as \"view_000\".")
     if before_targets:
         before_targets(subject, sensors)
     folder = Path(targets) if targets else path.with_suffix("")
@@ -120,6 +131,10 @@ def _the_light(scene: mi.Scene, path: Path) -> mi.Emitter:
     if not known or not found[0].is_environment():
         raise UserError(f"Scene '{path}' has no environment emitter with the id 'light'; add "
                         f"<emitter type=\"constant\" id=\"light\"/> or an envmap as the initial lighting.")
+    others = [emitter.id() for emitter in scene.emitters() if emitter.id() != "light"]
+    if others:
+        raise UserError(f"Scene '{path}' has another emitter beside 'light' ('{others[0]}'); a fit explains "
+                        f"the images by one environment: take it out, its light is found as part of that.")
     return found[0]
 
 
@@ -136,9 +151,18 @@ def render_missing_targets(reference: Path, folder: Path, sensors: list[mi.Senso
     Raises:
         UserError: the reference cannot be loaded, or a target not be written.
     """
-    missing = [sensor for sensor in sensors if not (folder / f"{sensor.id()}.exr").exists()]
-    if not missing or not reference.is_file():
+    def absent() -> list[mi.Sensor]:
+        return [sensor for sensor in sensors if not (folder / f"{sensor.id()}.exr").exists()]
+
+    if not reference.is_file() or not absent():
         return
+    with locked(folder, wait=True):  # of two fits of a scene, one renders
+        remove_stale(folder)
+        _render(reference, folder, absent(), progress)
+
+
+def _render(reference: Path, folder: Path, missing: list[mi.Sensor],
+            progress: Callable[[int, int], None] | None) -> None:
     scene = _load(reference)
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
     for index, sensor in enumerate(missing):

@@ -68,8 +68,14 @@ def load_target(path: Path, width: int, height: int) -> Target:
         raise UserError(f"Target '{path}' has alpha between {alpha.min():.3g} and {alpha.max():.3g}; "
                         f"alpha is coverage and lies between 0 and 1.")
     pixels[..., 3] = np.clip(alpha, 0.0, 1.0)
+    depth = depth_file(path)
+    return Target(path, pixels, has_alpha, load_depth(depth, width, height) if depth else None)
+
+
+def depth_file(path: Path) -> Path | None:
+    """The depth map beside a target, if there is one."""
     depth = path.with_suffix(".depth.exr")
-    return Target(path, pixels, has_alpha, load_depth(depth, width, height) if depth.is_file() else None)
+    return depth if depth.is_file() else None
 
 
 def load_depth(path: Path, width: int, height: int) -> np.ndarray:

@@ -6,7 +6,7 @@ import pytest
 
 from gshell_mi.fit.bookkeeping.bookkeeping import Bookkeeping
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
-from gshell_mi.fit.bookkeeping.interrupt import Interrupt
+from gshell_mi.interrupt import Interrupt
 from gshell_mi.fit.bookkeeping.progress import Progress
 
 COUNT = 3
