@@ -31,7 +31,7 @@ KINDS = {
 }
 
 #: Bytes at either end of a file in which its tag is looked for.
-_ENDS = 1 << 16
+_ENDS = 1 << 20
 
 
 class OwnFolder:
@@ -140,6 +140,8 @@ class OwnFolder:
         for name in sorted(new, key=lambda name: (name == last, name)):
             (self.path / name).parent.mkdir(exist_ok=True)
             os.replace(staged / name, self.path / name)
+            if (staged / name).parent != staged:
+                remove_empty((staged / name).parent)
         self._remove(old - new)
         self.write_mark(new, beside)
 
@@ -210,18 +212,21 @@ def own_folder(path: Path, kind: str) -> Iterator[OwnFolder]:
                         f"free some space or mend its permissions.") from error
 
 
+def is_own_file(path: Path) -> bool:
+    """Whether a file is there that carries our ``TAG``, near its start or its end."""
+    if not _is_file(path):
+        return False
+    with open(path, "rb") as file:
+        start = file.read(_ENDS)
+        file.seek(max(0, os.fstat(file.fileno()).st_size - _ENDS))
+        return TAG.encode() in start or TAG.encode() in file.read()
+
+
 def check_own_file(path: Path) -> None:
-    """Raises ``UserError`` if there is something at ``path`` that does not carry our ``TAG``."""
-    if not os.path.lexists(path):
-        return
-    if _is_file(path):
-        with open(path, "rb") as file:
-            start = file.read(_ENDS)
-            file.seek(max(0, os.fstat(file.fileno()).st_size - _ENDS))
-            if TAG.encode() in start or TAG.encode() in file.read():
-                return
-    raise UserError(f"'{path}' exists and was not written by gshell_mi, so it is left alone; move it away or "
-                    f"choose another file with -o.")
+    """Raises ``UserError`` if there is something at ``path`` that is no file of ours."""
+    if os.path.lexists(path) and not is_own_file(path):
+        raise UserError(f"'{path}' exists and was not written by gshell_mi, so it is left alone; move it "
+                        f"away or choose another file with -o.")
 
 
 def remove_empty(folder: Path) -> None:

@@ -10,14 +10,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
 
 from ..compat import write_mesh
 from ..errors import UserError
 from ..extraction import extract
 from ..fields.visual_hull import visual_hull
+from ..files import replacing
 from ..fit.config import FitConfig
 from ..images import srgb
 from ..lattice import TetLattice
+from ..own_folder import TAG, check_own_file
 from ..scene import FitScene, load_fit_scene
 from ..views import PinholeViews
 from .camera import Camera
@@ -65,13 +68,18 @@ def check_scene(scene: str | Path, picture: str | Path | None = None) -> CheckRe
         picture: the PNG to write; default ``check.png`` in the folder of its targets.
 
     Raises:
-        UserError: the scene cannot be loaded, or the picture not be written.
+        UserError: the scene cannot be loaded, or the picture not be written, as where a file is in its place
+            that no check drew.
     """
     fit_scene = load_fit_scene(Path(scene))
     picture = Path(picture) if picture else Path(scene).with_suffix("") / "check.png"
+    check_own_file(picture)
     sheet = _Sheet(fit_scene)
+    tag = PngInfo()
+    tag.add_text("Software", TAG)
     try:
-        sheet.draw().save(picture)
+        with replacing(picture) as partial:
+            sheet.draw().save(partial, "PNG", pnginfo=tag)
     except OSError as error:
         raise UserError(f"'{picture}' cannot be written ({error.strerror or error}); mend its "
                         f"permissions.") from error

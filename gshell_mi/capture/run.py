@@ -12,16 +12,19 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
+from ..interrupt import check_interrupt
+from ..scene_files import scene_files
 from .camera import Camera
 from .config import AXES, CaptureConfig
 from .decoding import ColorDecoding, color_profile
-from .formats import read_capture
+from .formats import mitsuba, read_capture
 from .frames import Capture, Frame
 from .masks import Background, assign_masks
 from .prepare import Preparation, exposure_gains
 from .region import FLIPPED_AXES, find_box, likely_misreading
+from .staging import staged
 from .trouble import Thumbnail, find_trouble
-from .writer import scene_xml, sensors_xml, staged, write_record, write_target
+from .writer import scene_xml, sensors_xml, write_record, write_target
 
 #: An object farther from the origin than so many of its sizes is moved there.
 _FAR = 50.0
@@ -67,8 +70,10 @@ def import_capture(source: str | Path, output: str | Path, *, config: CaptureCon
     """
     config = config or CaptureConfig()
     source, output = Path(source), Path(output)
-    with staged(output, overwrite=overwrite, source=source) as partial:
-        return _Import(source, output, config, progress).write(partial)
+    with staged(output, overwrite=overwrite, source=source) as staging:
+        work = _Import(source, output, config, progress)
+        staging.check_inputs(work.inputs())
+        return work.write(staging.path)
 
 
 class _Import:
@@ -98,6 +103,15 @@ class _Import:
         self.thumbnails: list[Thumbnail] = []
         self.views: list[dict] = []
 
+    def inputs(self) -> set[Path]:
+        """The files that are read and could be mistaken for some that are written."""
+        files = {file for frame in self.capture.frames for file in (frame.image, frame.mask) if file}
+        if self.config.light is not None:
+            files.add(Path(self.config.light))
+        if self.capture.format == mitsuba.NAME:
+            files |= scene_files(mitsuba.find(self.capture.source))
+        return files
+
     def write(self, partial: Path) -> CaptureResult:
         stem = self.output.stem
         folder = partial / stem
@@ -116,6 +130,7 @@ class _Import:
     def _write_targets(self, folder: Path) -> None:
         empty = []
         for index, frame in enumerate(self.capture.frames):
+            check_interrupt()
             target = self.preparation.target(frame)
             if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
                 empty.append(frame.image.name)    # it would carve away everything that it frames

@@ -1,14 +1,9 @@
-"""A capture as a fit scene: XML, sensors, targets; all of it or nothing."""
+"""A capture as a fit scene: XML, sensors, targets."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -17,10 +12,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..compat import write_bitmap
-from ..errors import UserError
 from .camera import Camera
 
-#: Marks a folder as written by this module, which may then replace it; says where everything came from.
+#: Says where everything came from.
 RECORD = "capture.json"
 
 
@@ -126,45 +120,3 @@ def read_record(folder: Path) -> Record:
         return Record(photographs, np.array(stored["capture_to_scene"], dtype=np.float64).reshape(4, 4))
     except (OSError, ValueError, KeyError, TypeError):
         return Record()
-
-
-@contextmanager
-def staged(output: Path, *, overwrite: bool, source: Path) -> Iterator[Path]:
-    """A temporary folder that becomes ``output`` (an XML file) and the folder of its stem at the end.
-
-    The block writes the XML file and that folder into it. If it fails, nothing remains and what was there
-    before is untouched.
-
-    Raises:
-        UserError: something is there already and may not be replaced, or the place cannot be written.
-    """
-    folder = output.with_suffix("")
-    if output.suffix != ".xml":
-        raise UserError(f"The output '{output}' must end in .xml; the targets go into a folder of the same "
-                        f"name beside it.")
-    if folder.exists() and folder.resolve() in (source.resolve(), *source.resolve().parents):
-        raise UserError(f"The output '{output}' would put its targets into '{folder}', where the capture is; "
-                        f"choose another name.")
-    if (output.exists() or folder.exists()) and not overwrite:
-        there = output if output.exists() else folder
-        raise UserError(f"'{there}' exists; replace it with --overwrite, or choose another output.")
-    if folder.exists() and not (folder / RECORD).is_file():
-        raise UserError(f"'{folder}' was not written by gshell_mi.capture, so --overwrite leaves it alone; "
-                        f"remove it or choose another output.")
-    partial = None
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        # On the same disk, so that moving it into place is a mere renaming.
-        partial = Path(tempfile.mkdtemp(prefix=f".{output.stem}.", suffix=".partial", dir=output.parent))
-        (partial / output.stem).mkdir()
-        yield partial
-        if folder.exists():
-            os.replace(folder, partial / "replaced")
-        os.replace(partial / output.stem, folder)
-        os.replace(partial / output.name, output)
-    except OSError as error:
-        raise UserError(f"'{output}' cannot be written ({error.strerror or error}); free some space, mend "
-                        f"its permissions or choose another output.") from error
-    finally:
-        if partial is not None:
-            shutil.rmtree(partial, ignore_errors=True)

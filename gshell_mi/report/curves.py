@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +17,19 @@ _ROW, _CHARACTERS = 14, 70
 
 
 def curves(log: Path) -> list[str]:
-    """One SVG per quantity: the losses of each stage on a logarithmic axis, and PSNR. Empty without a log."""
+    """One SVG per quantity: the losses of each stage on a logarithmic axis, and PSNR. Empty without a log;
+    lines of it that are no steps are left out."""
     if not log.is_file():
         return []
-    stages: dict[str, dict[str, list[tuple[int, float]]]] = {}
-    for line in log.read_text().splitlines():
-        entry = json.loads(line)
+    stages: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for line in log.read_bytes().splitlines():
+        entry = _step(line)
+        if entry is None:
+            continue
         stage = stages.setdefault(entry["stage"], {})
         for name, value in entry.items():
-            if name not in ("stage", "iteration", "seconds"):
-                stage.setdefault(name, []).append((entry["iteration"], value))
+            if name not in ("stage", "iteration", "seconds") and (number := _number(value)) is not None:
+                stage.setdefault(name, []).append((_number(entry["iteration"]), number))
     drawings = []
     for stage, series in stages.items():
         losses = {name: values for name, values in series.items() if name != "psnr"}
@@ -35,11 +39,29 @@ def curves(log: Path) -> list[str]:
     return drawings
 
 
+def _step(line: bytes) -> dict | None:
+    """A line of the log, if it is a step of a stage."""
+    try:
+        entry = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    known = isinstance(entry, dict) and isinstance(entry.get("stage"), str)
+    return entry if known and _number(entry.get("iteration")) is not None else None
+
+
+def _number(value: object) -> float | None:
+    try:
+        return float(value) if type(value) in (int, float) else None
+    except OverflowError:
+        return None
+
+
 def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic: bool = False) -> str:
+    title = escape(title)
     points = {}
     for name, values in series.items():
         x, y = (np.array(column, float) for column in zip(*values, strict=True))
-        keep = np.isfinite(y) & ((y > 0) if logarithmic else True)
+        keep = np.isfinite(x) & np.isfinite(y) & ((y > 0) if logarithmic else True)
         if keep.any():
             points[name] = (x[keep], np.log10(y[keep]) if logarithmic else y[keep])
     if not points:
@@ -62,7 +84,7 @@ def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic
     for number, (name, (x, y)) in enumerate(points.items()):
         color = _COLORS[number % len(_COLORS)]
         path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across(x), down(y), strict=True))
-        parts.append(f'<polyline points="{path}" stroke="{color}"><title>{name}</title></polyline>')
+        parts.append(f'<polyline points="{path}" stroke="{color}"><title>{escape(name)}</title></polyline>')
     return "".join([*parts, *legend, "</svg>"])
 
 
@@ -75,7 +97,7 @@ def _legend(names: list[str]) -> list[str]:
             rows.append([])
             used = 0
         color = _COLORS[number % len(_COLORS)]
-        rows[-1].append(f'<tspan dx="10" fill="{color}">{name.replace("_", " ")}</tspan>')
+        rows[-1].append(f'<tspan dx="10" fill="{color}">{escape(name.replace("_", " "))}</tspan>')
         used += len(name) + 2
     return [f'<text x="{_WIDTH / 2}" y="{_HEIGHT - 8 + _ROW * (row + 1)}" text-anchor="middle">'
             f'{"".join(tspans)}</text>' for row, tspans in enumerate(rows)]

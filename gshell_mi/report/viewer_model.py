@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import UserError
 from ..export.asset import y_up_turn
 from ..export.gltf import Part, glb_bytes, read_part
 from ..export.ply import read_ply
@@ -25,7 +26,11 @@ def viewer_model(folder: Path) -> bytes:
     ``back faces``, ``template`` and ``boundary loops`` name the materials; the template starts invisible.
     """
     base = (folder / "mesh.glb").read_bytes()
-    subject = read_part(base)
+    try:
+        subject = read_part(base)
+    except Exception as error:  # of anything that is no such file
+        raise UserError(f"'{folder / 'mesh.glb'}' cannot be read ({type(error).__name__}); write it again "
+                        f"with gshell_mi.export.") from error
     turn = y_up_turn(folder)
     mesh, template = read_ply(folder / "mesh.ply"), read_ply(folder / "template.ply")
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))

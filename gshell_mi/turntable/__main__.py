@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..command_line import run_command
-from .turntable import TurntableConfig, render_turntable, write_video
+from .turntable import TurntableConfig, render_turntable
+from .video import write_video
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,9 @@ from ..camera import Camera
 from ..decoding import SUFFIXES, image_size
 from ..frames import Capture, Frame, pose_of
 
+#: The format for people.
+NAME = "Mitsuba sensors"
+
 _Y_UP = np.array([0.0, 1.0, 0.0])
 #: Plugins by the names of their classes.
 _FILTERS = {"BoxFilter": "box", "GaussianFilter": "gaussian", "TentFilter": "tent",
@@ -67,7 +70,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
             raise UserError(f"Image '{image}' is {width} x {height} pixels, but its sensor's film is "
                             f"{camera.width} x {camera.height}; resize one of them.")
         frames.append(Frame(image, camera))
-    return Capture("Mitsuba sensors", source, tuple(frames), up=_Y_UP)
+    return Capture(NAME, source, tuple(frames), up=_Y_UP)
 
 
 def camera_of(sensor: mi.Sensor, views: PinholeViews, index: int) -> Camera:
