@@ -40,6 +40,7 @@ class FitFolder:
     def __init__(self, output: Path, *, resume: bool, overwrite: bool):
         self.output, self.place = Path(output), Path(output)
         self._resume, self._overwrite = resume, overwrite
+        self._names: list[str] = list(_FIXED)
         self._stack = ExitStack()
 
     def __enter__(self) -> FitFolder:
@@ -62,24 +63,32 @@ class FitFolder:
     def __exit__(self, *_) -> None:
         self._stack.close()
 
-    def prepare(self, inputs: Iterable[Path], views: Iterable[str]) -> None:
-        """Makes the folder and the place to work in it, once all else is known to be in order.
+    def check(self, inputs: Iterable[Path], views: Iterable[str]) -> None:
+        """Checks, without a trace, what depends on the scene.
 
         Args:
             inputs: the files that the fit reads.
             views: ids of the sensors.
 
         Raises:
-            UserError: as in the class, and if an input is a file that the fit would replace.
+            UserError: an input is a file that the fit would replace, or as in the class.
         """
-        names = [*_FIXED, *(f"views/{view}.png" for view in views)]
+        self._names = [*_FIXED, *(f"views/{view}.png" for view in views)]
         own = OwnFolder(self.output, "fit")
-        own.check_inputs(inputs, names)
+        own.check_inputs(inputs, self._names)
+        self._check_free(own)
+
+    def prepare(self) -> None:
+        """Makes the folder and the place to work in it, once all else is known to be in order.
+
+        Raises:
+            UserError: as in the class.
+        """
+        own = OwnFolder(self.output, "fit")
         try:
             self.output.mkdir(parents=True, exist_ok=True)
             self._stack.enter_context(locked(self.output))
             self._choose_place()  # another run may have been here before the lock
-            self._check_free(own, names)
             own.check_writable([*own.present(), MARK])
             remove_stale(self.output)
             if self.place != self.output:
@@ -107,24 +116,25 @@ class FitFolder:
         unfinished = OwnFolder(self.output / _UNFINISHED, "fit")
         if self._resume:
             self.place = unfinished.path if CHECKPOINT in unfinished.present() else self.output
+            self._check_free(own)
             return
-        self._check_free(own, _FIXED)
+        self._check_free(own)
         earlier = [*own.present(), *unfinished.present()]
         if earlier and not self._overwrite:
             raise UserError(f"'{self.output}' holds an earlier fit ({earlier[0]}); continue it with "
                             f"--resume, replace it with --overwrite or choose another folder with -o.")
         self.place = unfinished.path if earlier else self.output
 
-    def _check_free(self, own: OwnFolder, names: Iterable[str]) -> None:
+    def _check_free(self, own: OwnFolder) -> None:
         # A checkpoint that could be read says itself that a fit wrote it.
         adopted = {CHECKPOINT, LOG} if self._resume else set()
-        own.check_free(set(names) - adopted)
+        own.check_free(set(self._names) - adopted)
         unfinished = self.output / _UNFINISHED
         if os.path.lexists(unfinished):
             if unfinished.is_symlink() or not OwnFolder(unfinished, "fit").is_marked():
                 raise UserError(f"'{unfinished}' is in the way and was not made by a fit; move it away or "
                                 f"choose another folder with -o.")
-            OwnFolder(unfinished, "fit").check_free(names)
+            OwnFolder(unfinished, "fit").check_free(self._names)
 
 
 def can_resume(output: Path) -> bool:

@@ -133,9 +133,14 @@ class _Fit:
             self.views = PinholeViews.from_sensors(self.scene.sensors)
             check_given(self.scene, config)
             check_depth(self.scene, self.views)
+            self.last_lattice = last = fit_lattice(self.scene.subject, config)
+            found = fingerprint(self.scene, last)
+            if resume:
+                check_fingerprint(self.checkpoint.inputs, found)
+            self.checkpoint.inputs = found
+            folder.check(scene_files(scene) | self.scene.target_files, self.views.ids)
         if not all(target.has_alpha for target in self.scene.targets):
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
-        self.last_lattice = last = fit_lattice(self.scene.subject, config)
         # Given fields may have detail that no coarser lattice holds.
         coarse = last.resolution if self.scene.subject.filename else config.start_resolution
         self.lattice = make_lattice(EARLY_GRIDS[last.grid], min(last.resolution, coarse))
@@ -145,11 +150,8 @@ class _Fit:
         steps = config.iterations and config.detail_iterations and config.field == "explicit"
         self.joint_lattice = self.late_lattice if steps else last
         self.pixels = PixelPool(self.views, self.scene.targets)
-        found = fingerprint(self.scene, last)
-        if resume:
-            check_fingerprint(self.checkpoint.inputs, found)
-        self.checkpoint.inputs = found
-        folder.prepare(scene_files(scene) | self.scene.target_files, self.views.ids)
+        # Nothing is written before all is known to be in order.
+        folder.prepare()
         if observer:
             observer.begin(self.scene)
 

@@ -6,7 +6,6 @@ import http
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from unittest.mock import patch
 
 from ..errors import UserError
 
@@ -52,8 +51,11 @@ def guarded_server() -> Iterator[None]:
         guarded.append(True)
         return serve(*arguments, process_request=answer, **others)
 
-    with patch.object(server, "serve", serve_guarded):
+    server.serve = serve_guarded
+    try:
         yield
+    finally:
+        server.serve = serve
     if not guarded:
         raise UserError("This version of viser cannot be kept to its own page; install another one, or leave "
                         "out --viewer.")
