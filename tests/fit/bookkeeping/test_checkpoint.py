@@ -132,7 +132,8 @@ def rename(arrays, before, after):
     lambda header, arrays: header | {"stage": "tea"}, lambda header, arrays: header | {"stage": 3},
     lambda header, arrays: header | {"iteration": -5}, lambda header, arrays: header | {"iteration": "1"},
     lambda header, arrays: header | {"iteration": True}, lambda header, arrays: header | {"config": []},
-    lambda header, arrays: header | {"seconds": [1]}, lambda header, arrays: header | {"seconds": {"hull": "1"}},
+    lambda header, arrays: header | {"seconds": [1]},
+    lambda header, arrays: header | {"seconds": {"hull": "1"}},
     lambda header, arrays: header | {"inputs": 1}, lambda header, arrays: header | {"inputs": {"views": 1}},
     lambda header, arrays: header.pop("arrays") and None, lambda header, arrays: header.pop("facts") and None,
     lambda header, arrays: arrays.pop("sdf") is None, lambda header, arrays: rename(arrays, "sdf", "sdg"),
@@ -158,7 +159,8 @@ def test_without_a_format(checkpoint, tmp_path):
 
 def test_one_that_unpacks_to_much_is_refused_unread(tmp_path):
     """100 MB of zeros in 100 kB; ours are not compressed."""
-    np.savez_compressed(tmp_path / "checkpoint.npz", header=np.array("{}"), sdf=np.zeros(100_000_000, np.uint8))
+    zeros = np.zeros(100_000_000, np.uint8)
+    np.savez_compressed(tmp_path / "checkpoint.npz", header=np.array("{}"), sdf=zeros)
     with pytest.raises(UserError, match=r"is damaged \(ValueError\)"):
         Checkpoint.load(tmp_path / "checkpoint.npz")
 

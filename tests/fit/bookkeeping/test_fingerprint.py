@@ -20,7 +20,7 @@ def test_the_same_scene_has_the_same(bowl_scene, found):
 
 
 @pytest.mark.parametrize(("changes", "words"), [
-    ({"lattice": "tet, 24 cells"}, "another lattice (tet, 24 cells instead of tet, 20 cells); resume it with"),
+    ({"lattice": "tet, 24 cells"}, "another lattice (tet, 24 cells instead of tet, 20 cells); resume it"),
     ({"light": "x", "material": "y"}, "another material of the gshell shape, another initial light; resume"),
     ({"targets": {}}, "another images of 'view_000', 'view_001', 'view_002' ...; resume"),
     ({"views": {}}, "another set of views (0 instead of 12"),
