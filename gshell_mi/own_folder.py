@@ -93,7 +93,7 @@ class OwnFolder:
         """Raises ``UserError`` if a file that is read is one that will be written or removed: one of those in
         ``files`` or ``names``."""
         own = {key: name for name in self.files.union(names) if (key := _key(self.path / name, link=True))}
-        for path in inputs:
+        for path in sorted(inputs):
             if _key(path) in own:
                 raise UserError(f"'{path}' is read by this run and would be replaced by it; choose another "
                                 f"place with -o.")

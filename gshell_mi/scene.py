@@ -65,8 +65,8 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
 
     Raises:
         UserError: the file is missing or not a Mitsuba scene, it has not exactly one gshell shape, no
-            emitter ``light`` or another one beside it, no sensors, sensors of the same id or of one that
-            cannot be a file's name, or a target is missing or unusable.
+            emitter ``light``, no sensors, sensors of the same id or of one that cannot be a file's name, or a
+            target is missing or unusable.
     """
     path = Path(path)
     if not path.is_file():
@@ -131,10 +131,6 @@ def _the_light(scene: mi.Scene, path: Path) -> mi.Emitter:
     if not known or not found[0].is_environment():
         raise UserError(f"Scene '{path}' has no environment emitter with the id 'light'; add "
                         f"<emitter type=\"constant\" id=\"light\"/> or an envmap as the initial lighting.")
-    others = [emitter.id() for emitter in scene.emitters() if emitter.id() != "light"]
-    if others:
-        raise UserError(f"Scene '{path}' has another emitter beside 'light' ('{others[0]}'); a fit explains "
-                        f"the images by one environment: take it out, its light is found as part of that.")
     return found[0]
 
 

@@ -15,6 +15,7 @@ from rich.table import Table
 from ..command_line import run_command
 from ..errors import UserError
 from ..evaluation import IMAGE_SCORES
+from ..files import replacing
 
 _MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 
@@ -51,13 +52,17 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _score(given: _Arguments) -> None:
+    if given.json and given.json.exists() and any(
+            path and path.exists() and path.samefile(given.json) for path in (given.first, given.second)):
+        raise UserError(f"'{given.json}' is compared, and --json would replace it; choose another file.")
     try:
         result = _compare(given)
         if given.json:
-            given.json.write_text(json.dumps(result, indent=1))
+            with replacing(given.json) as partial:
+                partial.write_text(json.dumps(result, indent=1))
     except OSError as error:
-        raise UserError(f"'{error.filename}' cannot be written ({error.strerror}); choose another "
-                        f"place.") from error
+        raise UserError(f"'{error.filename or given.json or given.output}' cannot be written "
+                        f"({error.strerror or error}); choose another place.") from error
     _show(result)
 
 

@@ -95,6 +95,8 @@ def test_other_sensors(sphere, tmp_path):
     (("{targets}/view_000.exr", "{fit}/scene.xml"), "cannot be read"),
     (("{targets}/view_000.exr", "{fit}/light.exr"), "only images of one size"),
     (("{targets}", "{dim}", "--json", "{none}/a/b.json"), "cannot be written"),
+    (("{targets}", "{dim}", "--json", "/dev/full/a"), "'/dev/full/a' cannot be written"),
+    (("{targets}/view_000.exr", "{dim}/view_000.exr", "--json", "{dim}/view_000.exr"), "is compared, and"),
 ])
 def test_mistakes(sphere, tmp_path, capsys, arguments, message):
     (tmp_path / "empty").mkdir()
