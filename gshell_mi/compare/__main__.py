@@ -52,10 +52,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _score(given: _Arguments) -> None:
-    if given.json and given.json.exists() and any(
-            path and path.exists() and path.samefile(given.json) for path in (given.first, given.second)):
-        raise UserError(f"'{given.json}' is compared, and --json would replace it; choose another file.")
     try:
+        if given.json and given.json.exists() and any(
+                path and path.exists() and path.samefile(given.json) for path in (given.first, given.second)):
+            raise UserError(f"'{given.json}' is compared, and --json would replace it; choose another file.")
         result = _compare(given)
         if given.json:
             with replacing(given.json) as partial:
