@@ -28,7 +28,7 @@ class _Arguments:
     check: bool = False
     """Draw check.png into the scene's folder: cameras, box, axes and visual hull over every view."""
     overwrite: bool = False
-    """Replace what an earlier import wrote."""
+    """Replace what an earlier import wrote; other files, as photographs in its folder, are left alone."""
     variant: str = "llvm_ad_rgb"
     """Mitsuba variant: llvm_ad_rgb (CPU) or cuda_ad_rgb (NVIDIA GPU)."""
     quiet: bool = False
