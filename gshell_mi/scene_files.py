@@ -6,21 +6,24 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree
 
+#: Folders in which files are looked for, at most.
+_ROOTS = 16
+
 _PARAMETER = re.compile(r"\$(\w+)")
 
 
 def scene_files(path: Path) -> set[Path]:
     """The XML file, those that it includes, and all files that any of its values names.
 
-    A value is taken for a file's name if there is such a file, beside the XML that holds it or beside
-    ``path``; what cannot be read as XML names none.
+    A value is taken for a file's name if there is such a file, beside the XML that holds it, beside ``path``
+    or in a folder that a ``<path>`` names; what cannot be read as XML names none.
     """
     found: set[Path] = set()
-    _gather(Path(path), Path(path).parent, {}, found)
+    _gather(Path(path), [Path(path).parent], {}, found)
     return found
 
 
-def _gather(path: Path, root: Path, parameters: dict[str, str], found: set[Path]) -> None:
+def _gather(path: Path, roots: list[Path], parameters: dict[str, str], found: set[Path]) -> None:
     found.add(path)
     try:
         document = ElementTree.parse(path).getroot()
@@ -28,14 +31,19 @@ def _gather(path: Path, root: Path, parameters: dict[str, str], found: set[Path]
         return
     parameters = parameters | {node.get("name", ""): node.get("value", "")
                                for node in document.iter("default")}
+
+    def resolved(value: str) -> str:
+        return _PARAMETER.sub(lambda match: parameters.get(match[1], match[0]), value)
+
+    folders = [resolved(node.get("value", "")) for node in document.iter("path")]
+    roots = (roots + [roots[0] / folder for folder in folders])[:_ROOTS]
     for node in document.iter():
         for value in node.attrib.values():
-            name = _PARAMETER.sub(lambda match: parameters.get(match[1], match[0]), value)
-            for file in {path.parent / name, root / name}:
+            for file in {folder / resolved(value) for folder in (path.parent, *roots)}:
                 if _is_file(file) and file not in found:
                     found.add(file)
                     if node.tag == "include":
-                        _gather(file, root, parameters, found)
+                        _gather(file, roots, parameters, found)
 
 
 def _is_file(path: Path) -> bool:

@@ -3,11 +3,12 @@ from gshell_mi.scene_files import scene_files
 
 def test_includes_values_and_parameters(tmp_path):
     (tmp_path / "in").mkdir()
-    for name in ("mesh.ply", "map.exr", "in/near.npz", "unused.exr"):
+    (tmp_path / "maps").mkdir()
+    for name in ("mesh.ply", "map.exr", "in/near.npz", "unused.exr", "maps/sky.exr"):
         (tmp_path / name).write_text("")
     (tmp_path / "scene.xml").write_text(f"""<scene version="3.0.0">
         <default name="where" value="{tmp_path}"/> <default name="kind" value="envmap"/>
-        <include filename="in/sensors.xml"/>
+        <path value="maps"/> <include filename="in/sensors.xml"/> <string name="filename" value="sky.exr"/>
         <emitter type="$kind"> <string name="filename" value="$where/map.exr"/> </emitter>
         <string name="missing" value="none.exr"/> <string name="long" value="{'x' * 5000}"/>
         <string name="empty" value=""/>
@@ -18,7 +19,8 @@ def test_includes_values_and_parameters(tmp_path):
     </scene>""")
     found = scene_files(tmp_path / "scene.xml")
     assert {file.resolve() for file in found} == {
-        tmp_path / name for name in ("scene.xml", "in/sensors.xml", "mesh.ply", "map.exr", "in/near.npz")}
+        tmp_path / name for name in ("scene.xml", "in/sensors.xml", "mesh.ply", "map.exr", "in/near.npz",
+                                     "maps/sky.exr")}
 
 
 def test_what_is_no_xml_names_nothing(tmp_path):
