@@ -92,7 +92,7 @@ def _ffmpeg(path: Path, size: tuple[int, int], fps: float) -> Iterator[BinaryIO]
             if process.wait() != 0 or broken or path.stat().st_size == 0:
                 told.seek(0)
                 lines = told.read().decode(errors="replace").strip().splitlines() or ["no reason given"]
-                raise OSError(f"ffmpeg: {lines[-1].rpartition(': ')[2]}")
+                raise OSError(f"ffmpeg: {lines[0].rpartition(': ')[2]}")
         finally:
             if process.poll() is None:
                 process.kill()
