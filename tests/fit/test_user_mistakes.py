@@ -386,20 +386,20 @@ def test_resume_with_other_settings(told, stopped):
 
 
 @pytest.mark.parametrize(("old", "new", "words"), [
-    ('value="20"', 'value="24"', "another lattice (flexicubes, 20 cells instead of flexicubes, 24 cells)"),
+    ('value="20"', 'value="24"', "(lattice: flexicubes, 20 cells instead of flexicubes, 24 cells)"),
     ('<integer name="resolution" value="20"/>',
      '<integer name="resolution" value="20"/> <string name="grid" value="tet"/>',
-     "another lattice (flexicubes, 20 cells instead of tet, 20 cells)"),
+     "(lattice: flexicubes, 20 cells instead of tet, 20 cells)"),
     ("</shape>", '<transform name="to_world"> <scale value="2"/> </transform> </shape>',
-     "another box of the gshell shape"),
+     "(to_world of the gshell shape)"),
     ("</shape>", '<bsdf type="diffuse"> <rgb name="reflectance" value="0.1"/> </bsdf> </shape>',
-     "another material"),
+     "(material of the gshell shape)"),
     ("</shape>", '</shape> <shape type="sphere"> <point name="center" x="9" y="0" z="0"/> </shape>',
-     "another objects"),
+     "(objects beside the gshell shape)"),
     ('<emitter type="constant" id="light"/>',
      '<emitter type="constant" id="light"> <rgb name="radiance" value="2"/> </emitter>',
-     "another initial light"),
-    ('"32"', '"33"', "another cameras of 'view_000'"),
+     "(initial light)"),
+    ('"32"', '"33"', "(cameras of 'view_000')"),
 ])
 def test_resume_with_another_scene(told, scene, stopped, old, new, words):
     change(scene, old, new)
@@ -408,13 +408,13 @@ def test_resume_with_another_scene(told, scene, stopped, old, new, words):
 
 def test_resume_with_other_targets(told, scene, stopped):
     rewrite(target(scene), lambda pixels: 0.9 * pixels)
-    assert "another images of 'view_003'; resume it with what it was started with" in told("--resume")
+    assert "(images of 'view_003'); resume with the same" in told("--resume")
 
 
 def test_resume_with_fewer_views(told, scene, stopped):
     sensors = re.compile(r'<sensor type="perspective" id="view_00[2-9].*?</sensor>', re.DOTALL)
     scene.write_text(sensors.sub("", scene.read_text()))
-    words = "another set of views (12 instead of 4: 'view_002', 'view_003', 'view_004' ...)"
+    words = "(12 views instead of 4: 'view_002', 'view_003', 'view_004' ...)"
     assert words in told("--resume")
 
 

@@ -15,8 +15,8 @@ from ...scene import FitScene
 
 #: What a message calls the parts, and what they are where that is short.
 _PARTS = {
-    "lattice": "lattice ({before} instead of {now})", "box": "box of the gshell shape (its to_world)",
-    "fields": "fields of the gshell shape (its filename)", "material": "material of the gshell shape",
+    "lattice": "lattice: {before} instead of {now}", "box": "to_world of the gshell shape",
+    "fields": "fields of the gshell shape", "material": "material of the gshell shape",
     "light": "initial light", "objects": "objects beside the gshell shape",
 }
 
@@ -34,8 +34,7 @@ def fingerprint(scene: FitScene, lattice: Lattice) -> dict[str, Any]:
     return {
         "lattice": f"{lattice.grid}, {lattice.resolution} cells",
         "box": _digest(np.array(subject.to_world.matrix)),
-        "fields": _digest(*(getattr(fields, name).numpy() for name in ("sdf", "msdf", "deform"))
-                          ) if fields else "",
+        "fields": _digest(fields.sdf, fields.msdf, fields.deform) if fields else "",
         "material": _of_parameters(scene.bsdf),
         "light": _of_parameters(scene.light),
         "objects": _digest(*map(_of_parameters, others)),
@@ -53,14 +52,14 @@ def check_fingerprint(before: Mapping[str, Any], now: Mapping[str, Any]) -> None
         earlier, later = before.get(name) or {}, now[name]
         if name == "views" and earlier.keys() != later.keys():
             changed = sorted(earlier.keys() ^ later.keys())
-            differing.append(f"set of views ({len(earlier)} instead of {len(later)}: {_some(changed)})")
+            differing.append(f"{len(earlier)} views instead of {len(later)}: {_some(changed)}")
             break
         changed = [view for view in later if earlier.get(view) != later[view]]
         if changed:
             differing.append(f"{text} of {_some(changed)}")
     if differing:
-        raise UserError(f"The checkpoint's fit had another {', another '.join(differing)}; resume it with "
-                        f"what it was started with, or start again with --overwrite.")
+        raise UserError(f"The checkpoint's fit was started with other inputs ({', '.join(differing)}); "
+                        f"resume with the same, or start again with --overwrite.")
 
 
 def _some(names: list[str]) -> str:
