@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..interrupt import check_interrupt
-from ..scene_files import scene_files
+from ..scene_inputs import scene_inputs
 from .camera import Camera
 from .config import AXES, CaptureConfig
 from .decoding import ColorDecoding, color_profile
@@ -109,7 +109,7 @@ class _Import:
         if self.config.light is not None:
             files.add(Path(self.config.light))
         if self.capture.format == mitsuba.NAME:
-            files |= scene_files(mitsuba.find(self.capture.source))
+            files |= scene_inputs(mitsuba.find(self.capture.source))
         return files
 
     def write(self, partial: Path) -> CaptureResult:

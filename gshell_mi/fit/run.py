@@ -24,7 +24,7 @@ from ..lattice import CubeLattice, Lattice, make_lattice
 from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
 from ..scene import load_fit_scene
-from ..scene_files import scene_files
+from ..scene_inputs import scene_inputs
 from ..topology import topology
 from ..triangles import positive_part
 from ..views import PinholeViews
@@ -138,7 +138,7 @@ class _Fit:
             if resume:
                 check_fingerprint(self.checkpoint.inputs, found)
             self.checkpoint.inputs = found
-            folder.check(scene_files(scene) | self.scene.target_files, self.views.ids)
+            folder.check(scene_inputs(scene) | self.scene.target_files, self.views.ids)
         if not all(target.has_alpha for target in self.scene.targets):
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
         # Given fields may have detail that no coarser lattice holds.

@@ -12,7 +12,7 @@ _ROOTS = 16
 _PARAMETER = re.compile(r"\$(\w+)")
 
 
-def scene_files(path: Path) -> set[Path]:
+def scene_inputs(path: Path) -> set[Path]:
     """The XML file, those that it includes, and all files that any of its values names.
 
     A value is taken for a file's name if there is such a file, beside the XML that holds it, beside ``path``

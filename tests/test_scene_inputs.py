@@ -1,4 +1,4 @@
-from gshell_mi.scene_files import scene_files
+from gshell_mi.scene_inputs import scene_inputs
 
 
 def test_includes_values_and_parameters(tmp_path):
@@ -17,7 +17,7 @@ def test_includes_values_and_parameters(tmp_path):
         <string name="filename" value="mesh.ply"/> <string name="filename" value="near.npz"/>
         <include filename="sensors.xml"/>
     </scene>""")
-    found = scene_files(tmp_path / "scene.xml")
+    found = scene_inputs(tmp_path / "scene.xml")
     assert {file.resolve() for file in found} == {
         tmp_path / name for name in ("scene.xml", "in/sensors.xml", "mesh.ply", "map.exr", "in/near.npz",
                                      "maps/sky.exr")}
@@ -26,5 +26,5 @@ def test_includes_values_and_parameters(tmp_path):
 def test_what_is_no_xml_names_nothing(tmp_path):
     for text in ("", "<scene", "\0", "<a>" * 100_000):
         (tmp_path / "scene.xml").write_text(text)
-        assert scene_files(tmp_path / "scene.xml") == {tmp_path / "scene.xml"}
-    assert scene_files(tmp_path / "none.xml") == {tmp_path / "none.xml"}
+        assert scene_inputs(tmp_path / "scene.xml") == {tmp_path / "scene.xml"}
+    assert scene_inputs(tmp_path / "none.xml") == {tmp_path / "none.xml"}
