@@ -24,7 +24,7 @@ def test_includes_values_and_parameters(tmp_path):
 
 
 def test_what_is_no_xml_names_nothing(tmp_path):
-    for text in ("", "<scene", "\0", "<a>" * 100_000):
+    for text in ("", "<scene", "\0", "<a>" * 10_000):
         (tmp_path / "scene.xml").write_text(text)
         assert scene_inputs(tmp_path / "scene.xml") == {tmp_path / "scene.xml"}
     assert scene_inputs(tmp_path / "none.xml") == {tmp_path / "none.xml"}
