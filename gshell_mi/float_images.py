@@ -1,0 +1,139 @@
+"""Floating point images from files: OpenEXR in its display window and its layer of colour, and what Mitsuba
+reads besides."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
+#: A file whose header promises more pixels is refused before they are made room for.
+MOST_PIXELS = 1 << 28
+#: What programs call the layer with the picture, if several layers have colours.
+_PICTURES = ("combined", "beauty", "rgba", "rgb")
+
+
+def is_exr(path: Path) -> bool:
+    """Whether a file is OpenEXR by its first bytes, whatever its name."""
+    with open(path, "rb") as file:
+        return file.read(4) == _EXR_MAGIC
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) of the image that ``read_float_image`` returns.
+
+    Raises:
+        ValueError, OSError, RuntimeError: the file is no image; the last line says why.
+    """
+    if not is_exr(path):
+        return tuple(mi.Bitmap(str(path)).size())
+    file = _open(path, header_only=True)
+    return _size(file.parts[_picture(file)[0]].header["displayWindow"])
+
+
+def read_float_image(path: Path) -> tuple[np.ndarray, str]:
+    """The pixels of an image file, linear where the file is of 8 or 16 bits.
+
+    Of an OpenEXR file, the display window is returned: what the data window has beyond it (overscan) is
+    left out, and what it lacks is 0. The picture is the unnamed layer, else the only one with colours, else
+    the one called Combined, beauty or RGBA; a single channel of any name is grey.
+
+    Returns:
+        (height, width, channels) float32, and the channels: ``RGBA``, ``RGB``, ``YA`` or ``Y``.
+
+    Raises:
+        ValueError, OSError, RuntimeError: the file is no such image; the last line says why.
+    """
+    if not is_exr(path):
+        return _read_by_mitsuba(path)
+    number, channels = _picture(_open(path, header_only=True))    # before there is room for pixels
+    part = _open(path, header_only=False).parts[number]
+    display, data = part.header["displayWindow"], part.header["dataWindow"]
+    width, height = _size(display)
+    (x, y), (right, bottom) = ((int(at) for at in corner - display[0]) for corner in data)
+    pixels = np.zeros((height, width, len(channels)), np.float32)
+    rows, columns = slice(max(y, 0), min(bottom + 1, height)), slice(max(x, 0), min(right + 1, width))
+    if rows.start >= rows.stop or columns.start >= columns.stop:
+        raise ValueError("its data window lies outside its display window")
+    for index, name in enumerate(channels.values()):
+        stored = part.channels[name].pixels
+        if stored.shape != (bottom + 1 - y, right + 1 - x):
+            raise ValueError(f"its channel {name} is stored at another resolution")
+        pixels[rows, columns, index] = stored[rows.start - y:rows.stop - y, columns.start - x:columns.stop - x]
+    return pixels, "".join(channels)
+
+
+def first_not_finite(pixels: np.ndarray) -> tuple[int, int] | None:
+    """(column, row) of the first pixel with NaN or infinity; None if all of (h, w, c) are finite."""
+    bad = ~np.isfinite(pixels).all(axis=-1)
+    if not bad.any():
+        return None
+    row, column = np.argwhere(bad)[0]
+    return int(column), int(row)
+
+
+def _read_by_mitsuba(path: Path) -> tuple[np.ndarray, str]:
+    bitmap = mi.Bitmap(str(path))
+    names = {mi.Bitmap.PixelFormat.Y: "Y", mi.Bitmap.PixelFormat.YA: "YA", mi.Bitmap.PixelFormat.RGB: "RGB",
+             mi.Bitmap.PixelFormat.RGBA: "RGBA"}
+    if bitmap.pixel_format() not in names:
+        raise ValueError(f"it has the channels {bitmap.pixel_format()}")
+    pixels = np.array(bitmap.convert(bitmap.pixel_format(), mi.Struct.Type.Float32, False))
+    return pixels.reshape(*pixels.shape[:2], -1), names[bitmap.pixel_format()]
+
+
+def _open(path: Path, *, header_only: bool) -> OpenEXR.File:
+    return OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+
+
+def _size(window: tuple[np.ndarray, np.ndarray]) -> tuple[int, int]:
+    width, height = (int(high) - int(low) + 1 for low, high in zip(*window, strict=True))
+    if min(width, height) < 1:
+        raise ValueError("its window is empty")
+    if width * height > MOST_PIXELS:
+        raise ValueError(f"its header promises {width} x {height} pixels")
+    return width, height
+
+
+def _picture(file: OpenEXR.File) -> tuple[int, dict[str, str]]:
+    """The number of the part with the picture, and the file's name of each of its channels R, G, B, A or Y, A."""
+    layers: dict[tuple[int, str], dict[str, str]] = {}
+    for number, part in enumerate(file.parts):
+        for channel in part.header["channels"]:
+            layer, _, name = channel.name.rpartition(".")
+            layers.setdefault((number, layer), {})[name.upper()] = channel.name
+    chosen = _chosen(layers, [part.name() for part in file.parts])
+    part = file.parts[chosen[0]]
+    for window in ("displayWindow", "dataWindow"):
+        _size(part.header[window])
+    if part.type() not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
+        raise ValueError("it is a deep image; flatten it")
+    names = layers[chosen]
+    if "R" in names:
+        return chosen[0], {name: names[name] for name in "RGBA" if name in names}
+    grey = "Y" if "Y" in names else next(iter(names))
+    return chosen[0], {"Y": names[grey]} | ({"A": names["A"]} if "A" in names and grey != "A" else {})
+
+
+def _chosen(layers: dict[tuple[int, str], dict[str, str]], parts: list[str]) -> tuple[int, str]:
+    colored = [key for key, names in layers.items() if {"R", "G", "B"} <= names.keys()]
+    if (0, "") in colored:
+        return 0, ""
+    if len(colored) > 1:
+        called = [f"{parts[number]}.{layer}".strip(".").rpartition(".")[2].lower() for number, layer in colored]
+        pictures = [key for name in _PICTURES for key, own in zip(colored, called, strict=True) if own == name]
+        colored = pictures[:1] or colored
+    if len(colored) == 1:
+        return colored[0]
+    if not colored and {"Y", "RY", "BY"} <= layers.get((0, ""), {}).keys():
+        raise ValueError("it stores luminance and chroma (Y, RY, BY) in place of R, G, B")
+    if not colored and "Y" in layers.get((0, ""), {}):
+        return 0, ""
+    if sum(len(names) for names in layers.values()) == 1:
+        return next(iter(layers))
+    names = ", ".join(sorted(name for found in layers.values() for name in found.values())[:12])
+    what = "several layers with colours" if colored else "no layer with R, G and B"
+    raise ValueError(f"it has {what} (its channels are {names}); write the one you mean by itself")
