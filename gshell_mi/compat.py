@@ -16,6 +16,26 @@ import numpy as np
 #: Major and minor version of Dr.Jit.
 DRJIT_VERSION = tuple(int(part) for part in dr.__version__.split(".")[:2])
 
+#: Integrators that Mitsuba registers from Python; all its other plugins are libraries in its folder.
+MITSUBA_INTEGRATORS = ("prb", "prb_basic", "prb_projective", "prbvolpath", "direct_projective",
+                       "volprim_rf_basic")
+
+
+def mitsuba_folder() -> Path:
+    """Where Mitsuba is installed, with its own plugins in ``plugins``."""
+    return Path(mi.__file__).resolve().parent
+
+
+def trust_only_own_plugins() -> None:
+    """Puts Mitsuba's folder in front of its resource path, where it looks for plugins by name.
+
+    Otherwise ``plugins/path.so`` in the folder of a scene, or in the current one, would be taken for Mitsuba's
+    integrator, and run.
+    """
+    resolver, own = mi.file_resolver(), mitsuba_folder()
+    if Path(str(resolver[0])).resolve() != own:
+        resolver.prepend(str(own))
+
 
 def environment_data(radiance: mi.TensorXf) -> mi.TensorXf:
     """The ``data`` parameter of an ``envmap`` emitter for an image of shape (height, width, 3).

@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import trimesh
 from PIL import Image
 
 from ..errors import UserError
+from ..scene_files import load_scene
 from .atlas import unwrap
 from .bake import Textures, bake, project, vertex_tangents
 from .gltf import Part, write_glb
@@ -140,7 +140,7 @@ def _write_obj(folder: Path, vertices: np.ndarray, normals: np.ndarray, faces: n
         Image.fromarray(image).save(folder / f"mesh_{name}.png")
     (folder / "mesh.mtl").write_text(
         "newmtl subject\nKd 1 1 1\nillum 2\nmap_Kd mesh_base_color.png\nmap_Pr mesh_roughness.png\n"
-        "map_Pm mesh_metallic.png\nnorm mesh_normal.png\n")
+        "map_Pm mesh_metallic.png\nnorm mesh_normal.png\n", encoding="utf-8")
     # Welded: one position per point, or simulators would tear the object along the atlas's seams.
     welded, index = np.unique(vertices, axis=0, return_inverse=True)
     index = index.ravel()
@@ -150,7 +150,7 @@ def _write_obj(folder: Path, vertices: np.ndarray, normals: np.ndarray, faces: n
     lines += [f"vn {x:.5g} {y:.5g} {z:.5g}" for x, y, z in normals.tolist()]
     corners = np.stack([index[faces], faces, faces], axis=-1) + 1
     lines += ["f " + " ".join(f"{p}/{t}/{n}" for p, t, n in face) for face in corners.tolist()]
-    (folder / "mesh.obj").write_text("\n".join(lines) + "\n")
+    (folder / "mesh.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -163,7 +163,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def y_up_turn(folder: Path) -> np.ndarray:
     """The rotation (3, 3) from the scene of the fit in ``folder`` to glTF's axes, y up; ``v @ turn.T``."""
     scene = folder / "scene.xml"
-    return _to_y_up(up_axis(mi.load_file(str(scene)).sensors()) if scene.is_file() else 1)
+    return _to_y_up(up_axis(load_scene(scene).sensors()) if scene.is_file() else 1)
 
 
 def _to_y_up(axis: int) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..files import replacing
 from ..images import over_white, psnr, triptych, write_png
+from ..scene_files import load_scene
 from ..topology import topology
 from .ply import write_ply
 from .slivers import without_slivers
@@ -67,7 +68,7 @@ def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dic
     """Writes ``metrics.json`` in one step, with the seconds per stage and their sum; returns its contents."""
     metrics = metrics | {"seconds": {**seconds, "total": round(sum(seconds.values()), 3)}}
     with replacing(output / "metrics.json") as partial:
-        partial.write_text(json.dumps(metrics, indent=1))
+        partial.write_text(json.dumps(metrics, indent=1), encoding="utf-8")
     return metrics
 
 
@@ -81,7 +82,7 @@ def _write_views(output: Path, fit: FitScene, count: int) -> dict[str, float]:
     """Renders the exported scene from ``count`` training views; writes triptychs, returns PSNR by view id."""
     folder = output / "views"
     folder.mkdir(exist_ok=True)
-    scene = mi.load_file(str(output / "scene.xml"))
+    scene = load_scene(output / "scene.xml")
     integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
     scores = {}
     for index in np.unique(np.linspace(0, len(fit.sensors) - 1, count).round().astype(int)):

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..compat import environment_radiance, write_bitmap
+from ..errors import UserError
 from ..files import replacing
 from ..material import ATTRIBUTES
 
@@ -59,8 +60,8 @@ _SENSOR = """\
     </sensor>"""
 
 #: Parameters of the two kinds of sensors: those that traversal shows, by their names in XML.
-_OPTICS = {"perspective": ("principal_point_offset_x", "principal_point_offset_y"),
-           "thinlens": ("aperture_radius", "focus_distance")}
+_OPTICS = {"perspective": ("principal_point_offset_x", "principal_point_offset_y", "near_clip", "far_clip"),
+           "thinlens": ("aperture_radius", "focus_distance", "near_clip", "far_clip")}
 
 
 def write_light(path: Path, given: mi.Emitter, optimised: EnvironmentLight | None) -> None:
@@ -97,7 +98,7 @@ def write_scene(path: Path, light: mi.Emitter, sensors: list[mi.Sensor]) -> None
     text = _SCENE.format(depth=MAX_DEPTH, textures=textures, light_to_world=light_to_world,
                          sensors="\n".join(_sensor(sensor) for sensor in sensors))
     with replacing(path) as partial:
-        partial.write_text(text)
+        partial.write_text(text, encoding="utf-8")
 
 
 def up_axis(sensors: list[mi.Sensor]) -> int:
@@ -108,7 +109,13 @@ def up_axis(sensors: list[mi.Sensor]) -> int:
     >>> look = mi.ScalarTransform4f().look_at(origin=[0, -3, 1], target=[0, 0, 0], up=[0, 0, 1])
     >>> up_axis([mi.load_dict({"type": "perspective", "to_world": look})])
     2
+
+    Raises:
+        UserError: there is no sensor.
     """
+    if not sensors:
+        raise UserError("The scene of the fit has no sensors, so nothing says which way is up; run the fit "
+                        "again, or put its scene.xml back.")
     up = np.mean([np.array(mi.traverse(sensor)["to_world"].matrix).reshape(4, 4)[:3, 1]
                   for sensor in sensors], axis=0)
     return int(np.argmax(np.concatenate([up, -up])))

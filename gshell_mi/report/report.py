@@ -67,8 +67,8 @@ def write_report(folder: Path, config: ReportConfig | None = None) -> Path:
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
                                      lstrip_blocks=True)
     environment.filters["counted"] = counted
-    template = environment.from_string((page / "report.html.j2").read_text())
-    library = (page / "model-viewer.min.js").read_text().rpartition("//# sourceMappingURL")[0]
+    template = environment.from_string((page / "report.html.j2").read_text(encoding="utf-8"))
+    library = (page / "model-viewer.min.js").read_text(encoding="utf-8").rpartition("//# sourceMappingURL")[0]
     text = template.render(
         name=Path(metrics["scene"]).stem, metrics=metrics, turntable=video_data,
         model=_data_url("model/gltf-binary", viewer_model(folder)), library=Markup(library),
