@@ -38,7 +38,7 @@ def read_environment_map(path: Path, name: str) -> np.ndarray:
 
 
 def environment_emitter(path: Path, name: str) -> mi.Emitter:
-    """An ``envmap`` emitter with the id ``light`` of the file ``path``; errors as ``read_environment_map``."""
+    """An ``envmap`` emitter with the id ``light`` of a file; raises what ``read_environment_map`` does."""
     radiance = read_environment_map(path, name)
     try:
         return mi.load_dict({"type": "envmap", "id": "light", "bitmap": mi.Bitmap(radiance)})

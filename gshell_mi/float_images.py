@@ -3,11 +3,15 @@ reads besides."""
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
+import Imath
 import mitsuba as mi
 import numpy as np
 import OpenEXR
+
+from .compat import without_chatter
 
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 #: A file whose header promises more pixels is refused before they are made room for.
@@ -49,20 +53,23 @@ def read_float_image(path: Path) -> tuple[np.ndarray, str]:
     """
     if not is_exr(path):
         return _read_by_mitsuba(path)
-    number, channels = _picture(_open(path, header_only=True))    # before there is room for pixels
-    part = _open(path, header_only=False).parts[number]
-    display, data = part.header["displayWindow"], part.header["dataWindow"]
+    file = _open(path, header_only=True)
+    number, channels = _picture(file)
+    display, data = (file.parts[number].header[window] for window in ("displayWindow", "dataWindow"))
     width, height = _size(display)
     (x, y), (right, bottom) = ((int(at) for at in corner - display[0]) for corner in data)
     pixels = np.zeros((height, width, len(channels)), np.float32)
     rows, columns = slice(max(y, 0), min(bottom + 1, height)), slice(max(x, 0), min(right + 1, width))
     if rows.start >= rows.stop or columns.start >= columns.stop:
         raise ValueError("its data window lies outside its display window")
-    for index, name in enumerate(channels.values()):
-        stored = part.channels[name].pixels
-        if stored.shape != (bottom + 1 - y, right + 1 - x):
+    with without_chatter():
+        stored = _stored(path, number, list(channels.values()))
+    for index, (name, values) in enumerate(stored.items()):
+        if values.size != (bottom + 1 - y) * (right + 1 - x):
             raise ValueError(f"its channel {name} is stored at another resolution")
-        pixels[rows, columns, index] = stored[rows.start - y:rows.stop - y, columns.start - x:columns.stop - x]
+        values = values.reshape(bottom + 1 - y, right + 1 - x)
+        pixels[rows, columns, index] = values[rows.start - y:rows.stop - y,
+                                              columns.start - x:columns.stop - x]
     return pixels, "".join(channels)
 
 
@@ -86,7 +93,24 @@ def _read_by_mitsuba(path: Path) -> tuple[np.ndarray, str]:
 
 
 def _open(path: Path, *, header_only: bool) -> OpenEXR.File:
-    return OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+    with without_chatter() if header_only else nullcontext():
+        file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+    if not file.parts:
+        raise ValueError("it is damaged")
+    return file
+
+
+def _stored(path: Path, number: int, names: list[str]) -> dict[str, np.ndarray]:
+    """The values of channels of one part, in the order of the file's pixels."""
+    if number > 0:
+        part = _open(path, header_only=False).parts[number]
+        return {name: np.asarray(part.channels[name].pixels, np.float32) for name in names}
+    # The older interface knows the first part only, but says what is wrong with it, and does not print it.
+    file = OpenEXR.InputFile(str(path))
+    if not file.isComplete():
+        raise ValueError("it is cut off")
+    read = file.channels(names, Imath.PixelType(Imath.PixelType.FLOAT))
+    return {name: np.frombuffer(values, np.float32) for name, values in zip(names, read, strict=True)}
 
 
 def _size(window: tuple[np.ndarray, np.ndarray]) -> tuple[int, int]:
@@ -99,7 +123,7 @@ def _size(window: tuple[np.ndarray, np.ndarray]) -> tuple[int, int]:
 
 
 def _picture(file: OpenEXR.File) -> tuple[int, dict[str, str]]:
-    """The number of the part with the picture, and the file's name of each of its channels R, G, B, A or Y, A."""
+    """The number of the part with the picture, and the names that its channels R, G, B, A or Y, A have."""
     layers: dict[tuple[int, str], dict[str, str]] = {}
     for number, part in enumerate(file.parts):
         for channel in part.header["channels"]:
@@ -123,8 +147,8 @@ def _chosen(layers: dict[tuple[int, str], dict[str, str]], parts: list[str]) -> 
     if (0, "") in colored:
         return 0, ""
     if len(colored) > 1:
-        called = [f"{parts[number]}.{layer}".strip(".").rpartition(".")[2].lower() for number, layer in colored]
-        pictures = [key for name in _PICTURES for key, own in zip(colored, called, strict=True) if own == name]
+        called = {key: f"{parts[key[0]]}.{key[1]}".strip(".").rpartition(".")[2].lower() for key in colored}
+        pictures = [key for name in _PICTURES for key in colored if called[key] == name]
         colored = pictures[:1] or colored
     if len(colored) == 1:
         return colored[0]

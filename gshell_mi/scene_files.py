@@ -60,7 +60,8 @@ def load_scene(path: str | Path, *, name: str = "Scene") -> mi.Scene:
     except UserError:
         raise
     except Exception as error:
-        raise UserError(f"{name} '{path}' cannot be loaded by Mitsuba: {_reason(error)}") from error
+        reason = _reason(error).rstrip(". ")
+        raise UserError(f"{name} '{path}' cannot be loaded by Mitsuba: {reason}; correct the file.") from error
     scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene
     if not isinstance(scene, mi.Scene):
         raise UserError(f"{name} '{path}' holds no <scene>; give a Mitsuba scene file.")
@@ -113,7 +114,7 @@ def _check_document(path: Path, root: Path, defaults: dict[str, str], level: int
     try:
         _parse(path, started, ended)
     except expat.ExpatError as error:
-        raise ValueError(f"'{path}' is no XML file ({error}); correct it") from error
+        raise ValueError(f"'{path}' is no XML file ({error})") from error
     if level < _MOST_INCLUDES:
         for name in included:
             found = next((folder / name for folder in (path.parent, root) if (folder / name).is_file()), None)
@@ -143,11 +144,11 @@ def _resolving_beside(path: Path) -> Iterator[None]:
 
 def _check_plugin(name: str) -> None:
     # Names that are registered in Python for this variant are found without a search for a file.
-    registered = ("scene",) if mi.variant().startswith("scalar") else ("scene", *OWN_PLUGINS, *MITSUBA_INTEGRATORS)
+    registered = () if mi.variant().startswith("scalar") else (*OWN_PLUGINS, *MITSUBA_INTEGRATORS)
     native = re.fullmatch(r"\w+", name) and any((mitsuba_folder() / "plugins").glob(f"{name}.*"))
-    if name not in registered and not native:
-        raise ValueError(f"it names a plugin '{name}', which neither Mitsuba nor gshell_mi has; scenes may not "
-                         f"bring code of their own")
+    if name not in ("scene", *registered) and not native:
+        raise ValueError(f"it names a plugin '{name}', which neither Mitsuba nor gshell_mi has; scenes may "
+                         f"not bring code of their own")
 
 
 def _check_images(props: mi.Properties) -> None:

@@ -187,6 +187,17 @@ def color_profile(path: Path) -> str | None:
         return None
 
 
+def exif_orientation(path: Path) -> int:
+    """How a photograph is to be turned for people, 1 to 8 as in EXIF; 1, as stored, if it does not tell."""
+    if path.suffix.lower() not in _EXIF_SUFFIXES:
+        return 1
+    try:
+        with Image.open(path) as image:
+            return int(image.getexif().get(ExifTags.Base.Orientation, 1))
+    except (OSError, SyntaxError, TypeError, ValueError):
+        return 1
+
+
 def exif_exposure(path: Path) -> float | None:
     """Exposure of a photograph in stops above 1 s at f/1 and ISO 100; None if its EXIF data do not tell."""
     if path.suffix.lower() not in _EXIF_SUFFIXES:
