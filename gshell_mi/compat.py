@@ -41,7 +41,7 @@ def trust_only_own_plugins() -> None:
         resolver.prepend(str(own))
 
 
-_silence = threading.Lock()
+_silence = threading.RLock()
 
 
 @contextmanager

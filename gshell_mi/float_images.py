@@ -3,7 +3,6 @@ reads besides."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 
 import Imath
@@ -93,7 +92,7 @@ def _read_by_mitsuba(path: Path) -> tuple[np.ndarray, str]:
 
 
 def _open(path: Path, *, header_only: bool) -> OpenEXR.File:
-    with without_chatter() if header_only else nullcontext():
+    with without_chatter():
         file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
     if not file.parts:
         raise ValueError("it is damaged")

@@ -60,8 +60,8 @@ def load_scene(path: str | Path, *, name: str = "Scene") -> mi.Scene:
     except UserError:
         raise
     except Exception as error:
-        reason = _reason(error).rstrip(". ")
-        raise UserError(f"{name} '{path}' cannot be loaded by Mitsuba: {reason}; correct the file.") from error
+        raise UserError(f"{name} '{path}' cannot be loaded by Mitsuba: {_reason(error)}; correct "
+                        f"it.") from error
     scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene
     if not isinstance(scene, mi.Scene):
         raise UserError(f"{name} '{path}' holds no <scene>; give a Mitsuba scene file.")
@@ -177,4 +177,4 @@ def _reason(error: Exception) -> str:
     lines = str(error).strip().splitlines() or [repr(error)]
     # A plugin's own complaint comes below the traceback that Mitsuba puts into its message.
     _, found, complaint = lines[-1].partition(f"{UserError.__name__}: ")
-    return complaint if found else lines[0]
+    return (complaint if found else lines[0]).rstrip(". ")

@@ -15,6 +15,7 @@ from ..compat import write_bitmap
 from ..environment_maps import read_environment_map
 from ..errors import UserError
 from ..float_images import is_exr
+from ..output_names import check_output_name
 from ..wording import counted
 from .camera import Camera
 from .config import AXES, CaptureConfig
@@ -73,6 +74,7 @@ def import_capture(source: str | Path, output: str | Path, *, config: CaptureCon
     """
     config = config or CaptureConfig()
     source, output = Path(source), Path(output)
+    check_output_name(output, "The output")
     with staged(output, overwrite=overwrite, source=source) as partial:
         return _Import(source, output, config, progress).write(partial)
 

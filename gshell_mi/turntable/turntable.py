@@ -16,6 +16,7 @@ from ..export.fitted_scene import load_fitted_scene
 from ..export.ply import read_ply
 from ..export.stock_scene import up_axis
 from ..images import over_white
+from ..output_names import check_output_name
 from .looks import CHANNELS, Look, Studio, denoiser_available
 
 _FOV = 35.0
@@ -106,6 +107,8 @@ def orbit(vertices: np.ndarray, axis: int, count: int, elevation: float, size: i
         origin = center + distance * toward
         yield mi.load_dict({
             "type": "perspective", "fov": _FOV,
+            # Mitsuba's own would be 0.01 and 10 000, whatever the object's units.
+            "near_clip": 1e-3 * float(distance), "far_clip": 1e3 * float(distance),
             "to_world": mi.ScalarTransform4f().look_at(list(origin), list(center), list(up)),
             "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba",
                      "rfilter": {"type": "box"}}})
@@ -117,6 +120,7 @@ def write_video(frames: Iterable[np.ndarray], path: Path, fps: float, *, gif: bo
     Raises:
         UserError: the files cannot be written.
     """
+    check_output_name(Path(path), "The film")
     path = Path(path).with_suffix(".mp4")
     pictures, writer = [], None
     try:
