@@ -32,8 +32,6 @@ _MOST_INCLUDES = 15
 def load_scene(path: str | Path, *, name: str = "Scene") -> mi.Scene:
     """Loads a Mitsuba scene file that nobody vouches for.
 
-    A shape ``gshell`` keeps its class: Mitsuba's merging of meshes of equal materials is left out then.
-
     Args:
         path: the XML file.
         name: what it is called in messages.
@@ -50,7 +48,6 @@ def load_scene(path: str | Path, *, name: str = "Scene") -> mi.Scene:
         with _resolving_beside(path):
             config = mi.parser.ParserConfig(mi.variant())
             state = mi.parser.parse_file(config, str(path))
-            config.merge_meshes = not any(node.props.plugin_name() == "gshell" for node in state.nodes)
             trust_only_own_plugins()    # <path> has put its folders in front
             mi.parser.transform_all(config, state)
             for node in state.nodes:

@@ -104,8 +104,8 @@ def _united(mesh: trimesh.Trimesh, lattice: Lattice, winding: np.ndarray, name: 
 
 def _with_surface(sdf: np.ndarray, lattice: Lattice, name: str) -> LatticeFields:
     if not np.isfinite(sdf).all() or not (sdf < 0).any():
-        raise UserError(f"{name}: leaves no surface on a lattice with cells of {lattice.spacing:.3g} (half the "
-                        f"cube is 1), as it is too small or thin; raise the resolution, or lessen to_world")
+        raise UserError(f"{name}: leaves no surface on a lattice with cells of {lattice.spacing:.3g}, "
+                        f"as it is too small or thin; raise the resolution, or lessen to_world")
     return LatticeFields.closed(sdf, lattice.grid)
 
 
