@@ -70,7 +70,7 @@ def repeated_faces(meshes):
         faces = faces[faces[:, 0] < faces[:, 2]]    # a gshell's padding is no face
         repeated = len(faces) - len(np.unique(faces, axis=0))
         if repeated:
-            sentences.append(f"Mesh '{mesh.id()}' has {counted(repeated, 'repeated face')}: the derivatives of "
+            sentences.append(f"Mesh '{mesh.id()}' has {counted(repeated, 'repeated face')}: derivatives of "
                              "shadows count their silhouettes twice; leave one of each out.")
     return sentences
 
