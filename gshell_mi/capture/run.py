@@ -118,7 +118,8 @@ class _Import:
         if self.tests:
             (folder / "test.xml").write_text(sensors_xml(self.tests, depth), encoding="utf-8")
         document = scene_xml(stem, box, self.config.resolution, self._copy_light(folder))
-        (partial / self.output.name).write_text(document, encoding="utf-8")
+        # Names that the locale cannot spell come as escaped bytes, and go back as these.
+        (partial / self.output.name).write_text(document, encoding="utf-8", errors="surrogateescape")
         write_record(folder, self._record(box))
         return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings))
 

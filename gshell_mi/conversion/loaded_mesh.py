@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 
 from ..errors import UserError
+from ..mesh_files import check_triangles, read_triangles
 from ..topology import vertex_components
 from .orientation import oriented
 
@@ -29,22 +30,14 @@ def loaded_mesh(source: str | Path | trimesh.Trimesh, name: str,
         UserError: the file cannot be read, holds no triangles with an area, or positions that are NaN,
             infinite or missing.
     """
-    if isinstance(source, trimesh.Trimesh):
-        mesh = source
-    else:
-        try:
-            mesh = trimesh.load(source, force="mesh", process=False)
-        except Exception as error:
-            raise UserError(f"{name}: cannot be read as a triangle mesh ({error})") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise UserError(f"{name}: holds no triangles")
-    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise UserError(f"{name}: has faces of vertices that it lacks; export it again")
-    used, faces = np.unique(faces, return_inverse=True)
-    vertices, faces = vertices[used], faces.reshape(-1, 3)
-    if not np.isfinite(vertices).all():
-        raise UserError(f"{name}: has vertices at NaN or infinity; mend or delete them")
+    try:
+        if isinstance(source, trimesh.Trimesh):
+            vertices, faces = check_triangles(np.asarray(source.vertices, float),
+                                              np.asarray(source.faces, np.int64))
+        else:
+            vertices, faces = read_triangles(source)
+    except ValueError as error:
+        raise UserError(f"{name}: {error}; mend it or export it again") from error
     if to_world is not None:
         matrix = np.linalg.inv(np.asarray(to_world, float))
         vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]

@@ -66,6 +66,9 @@ def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
     fine = read_ply(folder / "mesh.ply")
     if len(fine.faces) == 0:
         raise UserError(f"'{folder / 'mesh.ply'}' is empty; there is nothing to export.")
+    lacking = [name for name in ("color", "roughness", "metallic") if name not in fine.attributes]
+    if lacking:
+        raise UserError(f"'{folder / 'mesh.ply'}' has no {lacking[0]}; run the fit again, which writes it.")
     turn = y_up_turn(folder)
     fine = FittedMesh(fine.vertices @ turn.T, fine.faces, fine.normals @ turn.T, fine.attributes)
     vertices, faces = _simplified(fine, config.face_count)

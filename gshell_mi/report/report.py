@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 import tempfile
 from dataclasses import dataclass
 from importlib.resources import files
@@ -16,10 +15,12 @@ import numpy as np
 from markupsafe import Markup
 from PIL import Image
 
+from ..environment_maps import read_environment_map
 from ..errors import UserError
 from ..export.asset import write_asset
 from ..files import replacing
 from ..images import srgb
+from ..json_files import read_json_object
 from ..turntable import TurntableConfig, render_turntable, write_video
 from ..wording import counted
 from .curves import curves
@@ -69,12 +70,15 @@ def write_report(folder: Path, config: ReportConfig | None = None) -> Path:
     environment.filters["counted"] = counted
     template = environment.from_string((page / "report.html.j2").read_text(encoding="utf-8"))
     library = (page / "model-viewer.min.js").read_text(encoding="utf-8").rpartition("//# sourceMappingURL")[0]
-    text = template.render(
-        name=Path(metrics["scene"]).stem, metrics=metrics, turntable=video_data,
-        model=_data_url("model/gltf-binary", viewer_model(folder)), library=Markup(library),
-        triptychs=_triptychs(folder / "views", config.views, metrics),
-        curves=[Markup(drawing) for drawing in curves(folder / "log.jsonl")],
-        probe=_image_url(_probe(folder / "light.exr")))
+    parts = {"turntable": video_data, "model": _data_url("model/gltf-binary", viewer_model(folder)),
+             "library": Markup(library), "probe": _image_url(_probe(folder / "light.exr")),
+             "curves": [Markup(drawing) for drawing in curves(folder / "log.jsonl")]}
+    try:
+        text = template.render(name=Path(metrics["scene"]).stem, metrics=metrics, **parts,
+                               triptychs=_triptychs(folder / "views", config.views, metrics))
+    except (jinja2.TemplateError, AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise UserError(f"'{folder / 'metrics.json'}' is not what a fit writes ({error}); run the fit "
+                        f"again.") from error
     with replacing(folder / "report.html") as partial:
         partial.write_text(text, encoding="utf-8")
     return folder / "report.html"
@@ -82,7 +86,7 @@ def write_report(folder: Path, config: ReportConfig | None = None) -> Path:
 
 def _metrics(path: Path) -> dict:
     try:
-        return json.loads(path.read_text())
+        return read_json_object(path)
     except (OSError, ValueError) as error:
         raise UserError(f"'{path}' is missing or no JSON; give the folder of a finished fit.") from error
 
@@ -93,7 +97,11 @@ def _triptychs(folder: Path, count: int, metrics: dict) -> list[dict]:
     chosen = np.unique(np.linspace(0, len(paths) - 1, count).round().astype(int)) if paths else []
     shown = []
     for path in (paths[i] for i in chosen):
-        pixels = np.asarray(Image.open(path).convert("RGB"))
+        try:
+            pixels = np.asarray(Image.open(path).convert("RGB"))
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            raise UserError(f"'{path}' is no picture ({error}); delete it and make the report "
+                            f"again.") from error
         width = pixels.shape[1] // 3
         target, fit, error = (_image_url(pixels[:, i * width:(i + 1) * width]) for i in range(3))
         shown.append({"name": path.stem, "target": target, "fit": fit, "error": error,
@@ -103,9 +111,8 @@ def _triptychs(folder: Path, count: int, metrics: dict) -> list[dict]:
 
 def _probe(path: Path) -> np.ndarray:
     """The light: its map, and a mirror ball and a grey ball in it, exposed alike; 8-bit."""
-    light = mi.load_dict({"type": "envmap", "filename": str(path)})
-    bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
-    radiance = np.array(bitmap)
+    radiance = read_environment_map(path, "Light")
+    light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(radiance)})
     size = _PROBE_HEIGHT
     sensor = {"type": "perspective", "fov": 30,
               "to_world": mi.ScalarTransform4f().look_at([0, 0.6, 4], [0, 0, 0], [0, 1, 0]),
