@@ -3,6 +3,7 @@ reads besides."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import Imath
@@ -15,6 +16,8 @@ from .compat import without_chatter
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 #: A file whose header promises more pixels is refused before they are made room for.
 MOST_PIXELS = 1 << 28
+#: Windows and sizes beyond these shares of each other come from damaged headers.
+_MOST_EMPTY, _MOST_PACKED = 100, 1 << 14
 #: What programs call the layer with the picture, if several layers have colours.
 _PICTURES = ("combined", "beauty", "rgba", "rgb")
 
@@ -34,7 +37,7 @@ def image_size(path: Path) -> tuple[int, int]:
     if not is_exr(path):
         return tuple(mi.Bitmap(str(path)).size())
     file = _open(path, header_only=True)
-    return _size(file.parts[_picture(file)[0]].header["displayWindow"])
+    return _size(file.parts[_picture(file, path)[0]].header["displayWindow"])
 
 
 def read_float_image(path: Path) -> tuple[np.ndarray, str]:
@@ -53,7 +56,7 @@ def read_float_image(path: Path) -> tuple[np.ndarray, str]:
     if not is_exr(path):
         return _read_by_mitsuba(path)
     file = _open(path, header_only=True)
-    number, channels = _picture(file)
+    number, channels = _picture(file, path)
     display, data = (file.parts[number].header[window] for window in ("displayWindow", "dataWindow"))
     width, height = _size(display)
     (x, y), (right, bottom) = ((int(at) for at in corner - display[0]) for corner in data)
@@ -121,7 +124,7 @@ def _size(window: tuple[np.ndarray, np.ndarray]) -> tuple[int, int]:
     return width, height
 
 
-def _picture(file: OpenEXR.File) -> tuple[int, dict[str, str]]:
+def _picture(file: OpenEXR.File, path: Path) -> tuple[int, dict[str, str]]:
     """The number of the part with the picture, and the names that its channels R, G, B, A or Y, A have."""
     layers: dict[tuple[int, str], dict[str, str]] = {}
     for number, part in enumerate(file.parts):
@@ -130,8 +133,12 @@ def _picture(file: OpenEXR.File) -> tuple[int, dict[str, str]]:
             layers.setdefault((number, layer), {})[name.upper()] = channel.name
     chosen = _chosen(layers, [part.name() for part in file.parts])
     part = file.parts[chosen[0]]
-    for window in ("displayWindow", "dataWindow"):
-        _size(part.header[window])
+    display, data = (_size(part.header[window]) for window in ("displayWindow", "dataWindow"))
+    if display[0] * display[1] > max(_MOST_EMPTY * data[0] * data[1], 1 << 22):
+        raise ValueError(f"its display window of {display[0]} x {display[1]} pixels is nearly all empty")
+    stored = 4 * data[0] * data[1]
+    if stored > _MOST_PACKED * os.path.getsize(path):
+        raise ValueError(f"its header promises {data[0]} x {data[1]} pixels, for which it is too short")
     if part.type() not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
         raise ValueError("it is a deep image; flatten it")
     names = layers[chosen]

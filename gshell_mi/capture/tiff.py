@@ -7,14 +7,18 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
+from ..float_images import MOST_PIXELS
+
 SUFFIXES = (".tif", ".tiff")
 
 
 def tiff_size(path: Path) -> tuple[int, int]:
     """(width, height) of the first picture in a TIFF file."""
     with tifffile.TiffFile(path) as file:
-        page = file.pages[0]
-        return page.imagewidth, page.imagelength
+        size = int(file.pages[0].imagewidth), int(file.pages[0].imagelength)
+    if min(size) < 1 or size[0] * size[1] > MOST_PIXELS:
+        raise ValueError(f"its header promises {size[0]} x {size[1]} pixels")
+    return size
 
 
 def read_tiff(path: Path) -> np.ndarray:
