@@ -14,8 +14,10 @@ The rooms, in the order in which data flows through them:
 - ``viewer``: a look at it while it runs, ``--viewer``
 - ``images``, ``topology``, ``export``, ``turntable``, ``report``: what it leaves behind
 - ``evaluation``, ``compare``: how good it is
-- ``command_line``, ``doctor``, ``errors``, ``files``, ``memory``: what the commands share; whether this
-  machine can run it all
+- ``scene_files``, ``float_images``, ``environment_maps``, ``mesh_files``, ``json_files``: files that anybody
+  may have written, read with care
+- ``command_line``, ``doctor``, ``errors``, ``files``, ``output_names``, ``memory``: what the commands share;
+  whether this machine can run it all
 - ``compat``, ``plugins``: what depends on Mitsuba's version, and how its plugins are registered
 
 Importing the package sets no variant; its plugins register for the variant in use and for every later one.

@@ -11,9 +11,9 @@ import pytest
 from gshell_mi.errors import UserError
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "pipelines"))
-import fuzz  # noqa: E402
-from fuzzing import targets  # noqa: E402
-from fuzzing.mutators import damage_file  # noqa: E402
+import fuzz
+from fuzzing import targets
+from fuzzing.mutators import damage_file
 
 #: A few of each; some hundred inputs in ten seconds.
 QUICK = {"nerf": 12, "colmap_text": 12, "llff": 12, "images": 8, "scene": 6, "mesh_ply": 8, "mesh_obj": 8,
@@ -66,8 +66,8 @@ def test_crashes_and_hangs_are_seen(monkeypatch):
 
     def worker(program):
         reading, writing = os.pipe()
-        process = subprocess.Popen([sys.executable, "-c", f"import os, signal, time; {program.format(writing)}"],
-                                   pass_fds=[writing])
+        program = "import os, signal, time; " + program.format(writing)
+        process = subprocess.Popen([sys.executable, "-c", program], pass_fds=[writing])
         os.close(writing)
         return process, reading
 
