@@ -105,8 +105,9 @@ def _the_light(scene: mi.Scene, path: Path) -> mi.Emitter:
     if not known or not found[0].is_environment():
         raise UserError(f"Scene '{path}' has no environment emitter with the id 'light'; add "
                         f"<emitter type=\"constant\" id=\"light\"/> or an envmap as the initial lighting.")
-    for name, value in mi.traverse(found[0]):
-        if name in ("data", "scale", "radiance.value") and not np.isfinite(np.array(value)).all():
+    parameters = mi.traverse(found[0])
+    for name in ("data", "scale", "radiance.value"):
+        if name in parameters and not np.isfinite(np.array(parameters[name])).all():
             raise UserError(f"The emitter 'light' of scene '{path}' has a {name} with NaN or infinity; give "
                             f"it finite values.")
     return found[0]

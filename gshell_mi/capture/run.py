@@ -75,6 +75,9 @@ def import_capture(source: str | Path, output: str | Path, *, config: CaptureCon
     config = config or CaptureConfig()
     source, output = Path(source), Path(output)
     check_output_name(output, "The output")
+    if "$" in output.name:
+        raise UserError(f"The output '{output}' has a $ in its name, which Mitsuba takes for a parameter; "
+                        f"choose another name.")
     with staged(output, overwrite=overwrite, source=source) as partial:
         return _Import(source, output, config, progress).write(partial)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
+from xml.sax.saxutils import quoteattr
 
 import mitsuba as mi
 import numpy as np
@@ -41,7 +42,7 @@ _SCENE = """\
 """
 
 _SENSOR = """\
-    <sensor type="{kind}" id="{id}">
+    <sensor type="{kind}" id={id}>
         <float name="fov" value="{fov}"/>
         <string name="fov_axis" value="x"/>
 {optics}
@@ -129,8 +130,8 @@ def _sensor(sensor: mi.Sensor) -> str:
     crop_x, crop_y = film.crop_offset()
     optics = "\n".join(f'        <float name="{name}" value="{float(np.ravel(parameters[name])[0]):.9g}"/>'
                        for name in _OPTICS[kind])
-    return _SENSOR.format(kind=kind, id=sensor.id(), fov=float(parameters["x_fov"][0]), optics=optics,
-                          to_world=_matrix(parameters["to_world"].matrix), width=width, height=height,
+    return _SENSOR.format(kind=kind, id=quoteattr(sensor.id()), fov=float(parameters["x_fov"][0]),
+                          optics=optics, to_world=_matrix(parameters["to_world"].matrix), width=width, height=height,
                           crop_width=crop_width, crop_height=crop_height, crop_x=crop_x, crop_y=crop_y)
 
 

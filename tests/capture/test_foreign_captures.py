@@ -99,7 +99,8 @@ def test_documents_that_break_readers(text, nerf, tmp_path, capfd):
 
 
 @pytest.mark.parametrize("output, words", [(".", "is no file name"), ("", "is no file name"),
-                                           ("x" * 300 + ".xml", "has a name of 304 bytes")])
+                                           ("x" * 300 + ".xml", "has a name of 304 bytes"),
+                                           ("my$vase.xml", "has a $ in its name")])
 def test_outputs_that_are_no_files(output, words, nerf, capfd, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert main([str(nerf), "-o", output]) == 2
