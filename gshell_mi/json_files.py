@@ -18,6 +18,10 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        raise
+    except ValueError:    # Python's own limit
+        raise ValueError("it holds an integer of thousands of digits") from None
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

@@ -127,9 +127,10 @@ class _Import:
         return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings))
 
     def _write_targets(self, folder: Path) -> None:
-        empty, faint = [], {}
+        empty, faint, most = [], {}, 0.0
         for index, frame in enumerate(self.capture.frames):
             target = self.preparation.target(frame)
+            most = max(most, target.covered)
             if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
                 empty.append(frame.image.name)    # it would carve away everything that it frames
                 continue
@@ -149,8 +150,8 @@ class _Import:
             if self.progress:
                 self.progress(index + 1, len(self.capture.frames))
         if not self.cameras:
-            raise UserError(f"The masks of all images of '{self.capture.source}' are empty; masks are white, "
-                            f"and alpha is 1, on the object.")
+            raise UserError(f"The masks of all images of '{self.capture.source}' are empty (their largest "
+                            f"coverage is {most:.2g}); masks are white, and alpha is 1, on the object.")
         if empty:
             some = ", ".join(empty[:3]) + (" ..." if len(empty) > 3 else "")
             what = "view with an empty mask is" if len(empty) == 1 else "views with empty masks are"

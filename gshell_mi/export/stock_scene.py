@@ -131,8 +131,9 @@ def _sensor(sensor: mi.Sensor) -> str:
     optics = "\n".join(f'        <float name="{name}" value="{float(np.ravel(parameters[name])[0]):.9g}"/>'
                        for name in _OPTICS[kind])
     return _SENSOR.format(kind=kind, id=quoteattr(sensor.id()), fov=float(parameters["x_fov"][0]),
-                          optics=optics, to_world=_matrix(parameters["to_world"].matrix), width=width, height=height,
-                          crop_width=crop_width, crop_height=crop_height, crop_x=crop_x, crop_y=crop_y)
+                          optics=optics, to_world=_matrix(parameters["to_world"].matrix),
+                          width=width, height=height, crop_width=crop_width, crop_height=crop_height,
+                          crop_x=crop_x, crop_y=crop_y)
 
 
 def _matrix(matrix) -> str:

@@ -95,7 +95,7 @@ def test_lists_that_match_nothing(value, words, nerf):
 def test_documents_that_break_readers(text, nerf, tmp_path, capfd):
     (nerf / "transforms.json").write_text(text, encoding="utf-8")
     assert main([str(nerf), "-o", str(tmp_path / "a.xml")]) == 2
-    assert re.fullmatch(r"error: .*\.\n", capfd.readouterr().err)
+    assert re.fullmatch(r"error: .*\.", capfd.readouterr().err.strip())
 
 
 @pytest.mark.parametrize("output, words", [(".", "is no file name"), ("", "is no file name"),
@@ -140,7 +140,7 @@ def test_models_without_lines_of_keypoints(model):
     path = model / "sparse" / "0" / "images.txt"
     whole = read_capture(model)
     lines = path.read_text(encoding="utf-8").splitlines()
-    kept = [line for line in lines if len(line.split()) == 10]
+    kept = [line for line in lines if "IMG" in line]
     path.write_text("\n".join(kept), encoding="utf-8")
     assert len(kept) == len(whole.frames) == len(CAMERAS)
     assert [f.image for f in read_capture(model).frames] == [f.image for f in whole.frames]
@@ -177,7 +177,7 @@ def test_of_several_models_the_one_with_most_images(model):
     small = shutil.copytree(model / "sparse" / "0", model / "sparse" / "1")
     (model / "sparse" / "0").rename(model / "sparse" / "2")
     lines = (small / "images.txt").read_text(encoding="utf-8").splitlines()
-    short = [line for line in lines if len(line.split()) == 10][:2]
+    short = [line for line in lines if "IMG" in line][:2]
     (small / "images.txt").write_text("\n\n".join(short), encoding="utf-8")
     assert colmap.find(model) == model / "sparse" / "2"
     capture = read_capture(model)
@@ -259,13 +259,13 @@ def test_grey_masks_are_told(nerf, tmp_path):
     def edit(document):
         for frame in document["frames"]:
             rgba = np.array(Image.open(nerf / frame["file_path"]))
-            rgba[..., 3] = rgba[..., 3] // 2
+            rgba[..., 3] = rgba[..., 3] // 4 * 3
             Image.fromarray(rgba).save(nerf / frame["file_path"])
 
     change(nerf, edit)
     result = import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(resolution=8))
     told = [warning for warning in result.warnings if "nowhere reach full coverage" in warning]
-    assert told and told[0].startswith("8 masks") and "frame_00000.png (0.50)" in told[0]
+    assert told and told[0].startswith("8 masks") and "frame_00000.png (0.74)" in told[0]
 
 
 # --- what is written

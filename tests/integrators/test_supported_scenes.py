@@ -11,7 +11,9 @@ BALL = trimesh.creation.icosphere(1)
 
 
 def mesh(faces, name="ball"):
-    return triangle_mesh(name, BALL.vertices, faces)
+    made = triangle_mesh(name, BALL.vertices, faces)
+    made.set_id(name)
+    return made
 
 
 def test_repeated_faces_are_counted_on_either_side():
