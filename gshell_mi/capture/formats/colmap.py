@@ -59,8 +59,8 @@ def _image_count(model: Path) -> int:
         with open(file, "rb") as stream:
             return int.from_bytes(stream.read(8), "little")
     with open(file, encoding="utf-8", errors="replace") as stream:
-        return sum(len(line.split(maxsplit=10)) >= 10 and not _are_keypoints(line) and not line.startswith("#")
-                   for line in stream)
+        lines = (line for line in stream if not line.startswith("#"))
+        return sum(len(line.split(maxsplit=10)) >= 10 and not _are_keypoints(line) for line in lines)
 
 
 def read(source: Path, images: Path | None = None) -> Capture:
