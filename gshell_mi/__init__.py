@@ -14,6 +14,8 @@ The rooms, in the order in which data flows through them:
 - ``viewer``: a look at it while it runs, ``--viewer``
 - ``images``, ``topology``, ``export``, ``turntable``, ``report``: what it leaves behind
 - ``evaluation``, ``compare``: how good it is
+- ``scene_files``, ``scene_inputs``, ``float_images``, ``environment_maps``, ``mesh_files``, ``json_files``:
+  files that anybody may have written, read with care
 - ``command_line``, ``streams``, ``interrupt``, ``errors``, ``files``, ``own_folder``, ``memory``: what the
   commands share; ``doctor``: whether this machine can run it all
 - ``compat``, ``plugins``: what depends on Mitsuba's version, and how its plugins are registered

@@ -125,18 +125,22 @@ def _try_lock(handle: int, *, wait: bool = False) -> bool | None:
     return True
 
 
-def name_trouble(name: str) -> str | None:
-    """Why a name cannot be that of a file in every place where it is used (a folder, XML, a URL); None if it
-    can.
+def name_trouble(name: str, *, in_scene: bool = True) -> str | None:
+    """Why a name cannot be that of a file that is written; None if it can.
+
+    Args:
+        in_scene: Mitsuba reads it in XML as well, where a $ begins a parameter.
 
     >>> name_trouble("view_003"), name_trouble("../view"), name_trouble("$spp")
     (None, "has a '/'", "has a '$', which Mitsuba takes for a parameter")
     """
     if name in ("", ".", ".."):
         return "is no name"
-    for character, why in (("/", ""), ("\\", ""), ("$", ", which Mitsuba takes for a parameter")):
+    for character in "/\\":
         if character in name:
-            return f"has a '{character}'{why}"
+            return f"has a '{character}'"
+    if in_scene and "$" in name:
+        return "has a '$', which Mitsuba takes for a parameter"
     if not name.isprintable():
         return "has characters that cannot be printed"
     if len(name.encode()) > 200:

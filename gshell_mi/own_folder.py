@@ -14,6 +14,7 @@ from pathlib import Path
 from . import __version__
 from .errors import UserError
 from .files import locked, remove_stale, replacing
+from .json_files import read_json
 
 #: The file that marks a folder as ours.
 MARK = "gshell_mi.json"
@@ -181,8 +182,8 @@ class OwnFolder:
 
     def _read(self) -> dict:
         try:
-            mark = json.loads((self.path / MARK).read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
+            mark = read_json(self.path / MARK)
+        except (OSError, ValueError):
             return {}
         return mark if isinstance(mark, dict) and mark.get("kind") in tuple(KINDS) else {}
 

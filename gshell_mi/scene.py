@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 
 from .compat import write_bitmap
 from .errors import UserError
 from .files import locked, name_trouble, remove_stale, replacing
+from .scene_files import load_scene
 from .targets import Target, depth_file, load_target
 
 #: Samples per pixel of targets rendered from a scene's reference.
@@ -71,7 +73,7 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
     path = Path(path)
     if not path.is_file():
         raise UserError(f"Scene '{path}' does not exist; give the path of a fit scene's XML file.")
-    scene = _load(path)
+    scene = load_scene(path)
     subject = _the_subject(scene, path)
     light = _the_light(scene, path)
     sensors = scene.sensors()
@@ -97,23 +99,6 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
     return FitScene(path, scene, subject, subject.bsdf(), light, sensors, loaded)
 
 
-def _load(path: Path) -> mi.Scene:
-    try:
-        return mi.load_file(str(path))
-    except UserError:
-        raise
-    except Exception as error:
-        raise UserError(f"Scene '{path}' cannot be loaded by Mitsuba: {_reason(error)}") from error
-
-
-def _reason(error: Exception) -> str:
-    """The one line of Mitsuba's message that says what is wrong."""
-    lines = str(error).strip().splitlines() or [repr(error)]
-    # A plugin's own complaint comes below the traceback that Mitsuba puts into its message.
-    _, found, complaint = lines[-1].partition(f"{UserError.__name__}: ")
-    return complaint if found else lines[0]
-
-
 def _the_subject(scene: mi.Scene, path: Path) -> mi.Shape:
     from .shape import GShell
 
@@ -131,6 +116,11 @@ def _the_light(scene: mi.Scene, path: Path) -> mi.Emitter:
     if not known or not found[0].is_environment():
         raise UserError(f"Scene '{path}' has no environment emitter with the id 'light'; add "
                         f"<emitter type=\"constant\" id=\"light\"/> or an envmap as the initial lighting.")
+    parameters = mi.traverse(found[0])
+    for name in ("data", "scale", "radiance.value"):
+        if name in parameters and not np.isfinite(np.array(parameters[name])).all():
+            raise UserError(f"The emitter 'light' of scene '{path}' has a {name} with NaN or infinity; give "
+                            f"it finite values.")
     return found[0]
 
 
@@ -159,7 +149,7 @@ def render_missing_targets(reference: Path, folder: Path, sensors: list[mi.Senso
 
 def _render(reference: Path, folder: Path, missing: list[mi.Sensor],
             progress: Callable[[int, int], None] | None) -> None:
-    scene = _load(reference)
+    scene = load_scene(reference)
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
     for index, sensor in enumerate(missing):
         if progress:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 
 from .errors import UserError
+from .float_images import first_not_finite, read_float_image
 
 #: Coverage above 1 by more than this is an error; below, rounding of half floats and filter lobes.
 _ALPHA_TOLERANCE = 0.05
@@ -43,23 +43,20 @@ def load_target(path: Path, width: int, height: int) -> Target:
             f"Target '{path}' is missing; render or copy it there, or name its folder with --targets."
         )
     try:
-        bitmap = mi.Bitmap(str(path))
+        pixels, channels = read_float_image(path)
     except Exception as error:
-        raise UserError(f"Target '{path}' cannot be read as an image ({_first_line(error)}); "
-                        f"write it again as an OpenEXR file.") from error
-    layout = mi.Bitmap.PixelFormat
-    if bitmap.pixel_format() not in (layout.RGB, layout.RGBA):
-        raise UserError(f"Target '{path}' has the channels '{bitmap.pixel_format()}'; "
+        raise UserError(f"Target '{path}' cannot be read as an image ({_first_line(error)}); write it again "
+                        f"as an OpenEXR file: a target needs R, G, B and A (or R, G and B).") from error
+    if channels not in ("RGB", "RGBA"):
+        raise UserError(f"Target '{path}' has the channels '{channels}'; "
                         f"a target needs R, G, B and A (or R, G and B).")
-    if tuple(bitmap.size()) != (width, height):
-        found_width, found_height = bitmap.size()
+    if pixels.shape[:2] != (height, width):
+        found_height, found_width = pixels.shape[:2]
         raise UserError(f"Target '{path}' is {found_width} x {found_height} pixels, but its sensor's film is "
                         f"{width} x {height}; resize one of them.")
-    has_alpha = bitmap.pixel_format() == layout.RGBA
-    pixels = np.array(bitmap.convert(bitmap.pixel_format(), mi.Struct.Type.Float32, False))
-    if not np.isfinite(pixels).all():
-        row, column = np.argwhere(~np.isfinite(pixels).all(axis=-1))[0]
-        raise UserError(f"Target '{path}' holds NaN or infinity (first at column {column}, row {row}); "
+    has_alpha = channels == "RGBA"
+    if bad := first_not_finite(pixels):
+        raise UserError(f"Target '{path}' holds NaN or infinity (first at column {bad[0]}, row {bad[1]}); "
                         f"mend or mask out those pixels.")
     if not has_alpha:
         pixels = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
@@ -90,11 +87,10 @@ def load_depth(path: Path, width: int, height: int) -> np.ndarray:
             negative distances or none at all.
     """
     try:
-        distance = np.array(mi.Bitmap(str(path)), np.float32)
+        distance = read_float_image(path)[0]
     except Exception as error:
         raise UserError(f"Depth map '{path}' cannot be read as an image ({_first_line(error)}); "
                         f"write it again as an OpenEXR file.") from error
-    distance = distance.reshape(*distance.shape[:2], -1)
     if distance.shape[2] > 1 and (distance != distance[..., :1]).any():
         raise UserError(f"Depth map '{path}' has {distance.shape[2]} different channels; write one, the "
                         f"distance along the ray.")
@@ -112,4 +108,4 @@ def load_depth(path: Path, width: int, height: int) -> np.ndarray:
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -122,3 +122,8 @@ def test_a_thread_takes_its_lock_again_and_another_does_not(tmp_path):
 def test_names(name, trouble):
     found = name_trouble(name)
     assert found is None if trouble is None else trouble in found
+
+
+def test_names_that_no_scene_holds():
+    assert name_trouble("$x.mp4", in_scene=False) is None
+    assert name_trouble("..", in_scene=False) == "is no name"

@@ -40,6 +40,7 @@ class Capture:
         up: unit direction that the format says is up; None if it says nothing.
         region: (2, 3) corners of a box that the format says holds the object, or None.
         has_opengl_axes: the format's camera axes are right, up, backward, which exporters get wrong.
+        notes: what the user should know of how the files were read, a sentence each.
     """
 
     format: str
@@ -48,6 +49,7 @@ class Capture:
     up: np.ndarray | None = None
     region: np.ndarray | None = None
     has_opengl_axes: bool = False
+    notes: tuple[str, ...] = ()
 
     @property
     def training(self) -> tuple[Frame, ...]:
@@ -72,7 +74,7 @@ def pose_of(matrix: object, owner: str) -> np.ndarray:
     """
     try:
         array = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, RecursionError):
         array = np.zeros(0)
     if array.shape == (3, 4):
         array = np.concatenate([array, [[0, 0, 0, 1]]])

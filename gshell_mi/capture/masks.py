@@ -9,11 +9,17 @@ import numpy as np
 from PIL import ImageColor
 
 from ..errors import UserError
-from .decoding import SUFFIXES, images_in, read_pixels
+from .decoding import SUFFIXES, exif_orientation, images_in, read_pixels
+from .file_names import Copies, existing
 from .frames import Capture, Frame
 
 #: Folders that data sets keep masks in, beside the images' folder or in the capture's.
 _FOLDERS = ("masks", "mask")
+
+#: From an image as EXIF orientation shows it to as it is stored, where that exchanges width and height:
+#: photographs are read as stored, as calibrations see them, but tools that make masks may turn them.
+_TURNED_BACK = {5: lambda mask: mask.swapaxes(0, 1), 6: lambda mask: np.rot90(mask),
+                7: lambda mask: np.rot90(mask, 2).swapaxes(0, 1), 8: lambda mask: np.rot90(mask, -1)}
 
 _SUPPLY = ("supply images with alpha, a folder of masks (white on the object) as 'masks' beside the images "
            "or with --masks, or the colour behind the object with --background")
@@ -59,8 +65,9 @@ class Background:
 def assign_masks(capture: Capture, folder: Path | None) -> Capture:
     """Finds the mask file of each frame.
 
-    Masks are matched to images by name (``IMG_1.png`` or ``IMG_1.jpg.png`` for ``IMG_1.jpg``, sub-folders
-    alike), or all by their order if no name matches and there are as many.
+    Masks are matched to images by name (``IMG_1.png`` or ``IMG_1.jpg.png`` for ``IMG_1.jpg``), in the same
+    sub-folders where several images have one name, or all by their order if no name matches and there are as
+    many.
 
     Args:
         folder: where they are; default: ``masks`` or ``mask`` if there is one, unless the format names
@@ -75,13 +82,18 @@ def assign_masks(capture: Capture, folder: Path | None) -> Capture:
             if missing:
                 raise UserError(f"The capture names masks, but none for '{missing.image}'; add it, or give "
                                 f"a folder of masks with --masks.")
+            lost = next((frame.mask for frame in capture.frames if not frame.mask.is_file()), None)
+            if lost:
+                raise UserError(f"Mask '{lost}' is missing, with or without a suffix such as .png; put it "
+                                f"there, or give a folder of masks with --masks.")
             return capture
         folder = _beside(capture)
         if folder is None:
             return capture
     elif not folder.is_dir():
         raise UserError(f"Mask folder '{folder}' does not exist; correct --masks.")
-    found = [_match(folder, frame.image) for frame in capture.frames]
+    copies = Copies(frame.image.as_posix() for frame in capture.frames)
+    found = [copies.find(folder, frame.image.as_posix(), _mask_of) for frame in capture.frames]
     if not any(found):
         inside = images_in(folder)
         if len(inside) != len(capture.frames):
@@ -106,13 +118,11 @@ def _beside(capture: Capture) -> Path | None:
     return None
 
 
-def _match(folder: Path, image: Path) -> Path | None:
-    # An image in a sub-folder of images/ may have its mask in the same sub-folder of masks/.
-    for inside in (folder, folder / image.parent.name):
-        for name in (image.name, image.name + ".png", *(image.stem + suffix for suffix in SUFFIXES)):
-            if (inside / name).is_file():
-                return inside / name
-    return None
+def _mask_of(image: Path) -> Path | None:
+    """The mask in the place of an image."""
+    names = (image.name, image.name + ".png", *(image.stem + suffix for suffix in SUFFIXES))
+    exact = next((image.with_name(name) for name in names if image.with_name(name).is_file()), None)
+    return exact or existing(image.with_name(image.stem)) or existing(image)
 
 
 def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None = None, *,
@@ -131,6 +141,9 @@ def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None 
         return background.coverage(_unit(pixels[..., :3])).astype(np.float32)
     if frame.mask is not None:
         mask = read_pixels(frame.mask)
+        orientation = exif_orientation(frame.image)
+        if orientation in _TURNED_BACK and mask.shape[:2] == pixels.shape[1::-1] != pixels.shape[:2]:
+            mask = _TURNED_BACK[orientation](mask)
         if mask.shape[:2] != pixels.shape[:2]:
             raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "
                             f"is {pixels.shape[1]} x {pixels.shape[0]}; resize it.")

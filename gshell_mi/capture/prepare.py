@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
+from ..json_files import read_json_object
 from .camera import Camera
 from .decoding import FLOAT_SUFFIXES, ColorDecoding, exif_exposure, read_pixels
 from .frames import Capture, Frame
@@ -28,11 +28,13 @@ class Prepared:
         rgba: (height, width, 4) float32, linear Rec.709, premultiplied by alpha = coverage.
         camera: the one with square pixels and without distortion that sees it.
         clipped: share of the object's pixels at the largest value of an integer file.
+        covered: the largest coverage of any pixel of the photograph.
     """
 
     rgba: np.ndarray
     camera: Camera
     clipped: float
+    covered: float
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class Preparation:
         np.clip(rgb, 0.0, _BRIGHTEST, out=rgb)
         image = np.concatenate([rgb, coverage], axis=-1)
         # The lens formula is in units of the focal length, so it holds for the small image, at less cost.
-        return Prepared(*rectify(*shrink(image, frame.camera, self.max_size)), _clipped(pixels, coverage))
+        return Prepared(*rectify(*shrink(image, frame.camera, self.max_size)), _clipped(pixels, coverage),
+                        float(coverage.max()))
 
     @staticmethod
     def _encoded(color: tuple[float, float, float], dtype: np.dtype) -> np.ndarray:
@@ -117,9 +120,8 @@ def exposure_gains(capture: Capture, file: Path | None, *, exif: bool = True) ->
 
 def _stops_from_file(file: Path, images: list[Path]) -> list[float]:
     try:
-        table = json.loads(file.read_text(encoding="utf-8-sig"))
-        table = {str(name): float(value) for name, value in table.items()}
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+        table = {name: float(value) for name, value in read_json_object(file).items()}
+    except (OSError, ValueError, TypeError, OverflowError) as error:
         raise UserError(f"--exposures '{file}' is no JSON object of stops by file name ({error}); write "
                         f"{{\"IMG_1.jpg\": 0.0, \"IMG_2.jpg\": -1.5}}.") from error
     for image in images:

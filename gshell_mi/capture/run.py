@@ -11,12 +11,16 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from ..compat import write_bitmap
+from ..environment_maps import read_environment_map
 from ..errors import UserError
+from ..float_images import is_exr
 from ..interrupt import check_interrupt
 from ..scene_inputs import scene_inputs
+from ..wording import counted
 from .camera import Camera
 from .config import AXES, CaptureConfig
-from .decoding import ColorDecoding, color_profile
+from .decoding import ColorDecoding, color_profile, exif_orientation
 from .formats import mitsuba, read_capture
 from .frames import Capture, Frame
 from .masks import Background, assign_masks
@@ -24,10 +28,12 @@ from .prepare import Preparation, exposure_gains
 from .region import FLIPPED_AXES, find_box, likely_misreading
 from .staging import staged
 from .trouble import Thumbnail, find_trouble
-from .writer import scene_xml, sensors_xml, write_record, write_target
+from .writer import clipping_depths, scene_xml, sensors_xml, write_record, write_target
 
 #: An object farther from the origin than so many of its sizes is moved there.
 _FAR = 50.0
+#: Masks whose largest coverage is less do not reach white; a rounded one may miss it by a little.
+_FAINT_MASK = 0.95
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ class _Import:
             replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames))
         gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
         self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains)
-        self.warnings = _profile_warning(capture, config)
+        self.warnings = [*capture.notes, *_profile_warning(capture, config), *_turned_warning(capture)]
         self.cameras: dict[str, Camera] = {}
         self.tests: dict[str, Camera] = {}
         self.thumbnails: list[Thumbnail] = []
@@ -119,22 +125,27 @@ class _Import:
         box = self._box()
         self.warnings += find_trouble(self.thumbnails, box, self.to_scene)
         box = self._brought_near(box)
-        (folder / "sensors.xml").write_text(sensors_xml(self.cameras, box), encoding="utf-8")
+        depth = clipping_depths([*self.cameras.values(), *self.tests.values()], box)
+        (folder / "sensors.xml").write_text(sensors_xml(self.cameras, depth), encoding="utf-8")
         if self.tests:
-            (folder / "test.xml").write_text(sensors_xml(self.tests, box), encoding="utf-8")
+            (folder / "test.xml").write_text(sensors_xml(self.tests, depth), encoding="utf-8")
         document = scene_xml(stem, box, self.config.resolution, self._copy_light(folder))
-        (partial / self.output.name).write_text(document, encoding="utf-8")
+        # Names that the locale cannot spell come as escaped bytes, and go back as these.
+        (partial / self.output.name).write_text(document, encoding="utf-8", errors="surrogateescape")
         write_record(folder, self._record(box))
         return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings))
 
     def _write_targets(self, folder: Path) -> None:
-        empty = []
+        empty, faint, most = [], {}, 0.0
         for index, frame in enumerate(self.capture.frames):
             check_interrupt()
             target = self.preparation.target(frame)
+            most = max(most, target.covered)
             if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
                 empty.append(frame.image.name)    # it would carve away everything that it frames
                 continue
+            if target.covered < _FAINT_MASK:
+                faint[frame.image.name] = target.covered
             name = f"test_{len(self.tests):03}" if frame.held_out else f"view_{len(self.cameras):03}"
             if frame.held_out:
                 (folder / "test").mkdir(exist_ok=True)
@@ -149,12 +160,17 @@ class _Import:
             if self.progress:
                 self.progress(index + 1, len(self.capture.frames))
         if not self.cameras:
-            raise UserError(f"The masks of all images of '{self.capture.source}' are empty; masks are white, "
-                            f"and alpha is 1, on the object.")
+            raise UserError(f"The masks of all images of '{self.capture.source}' are empty (their largest "
+                            f"coverage is {most:.2g}); masks are white, and alpha is 1, on the object.")
         if empty:
             some = ", ".join(empty[:3]) + (" ..." if len(empty) > 3 else "")
             what = "view with an empty mask is" if len(empty) == 1 else "views with empty masks are"
             self.warnings.append(f"{len(empty)} {what} left out: {some}.")
+        if faint:
+            some = ", ".join(f"{name} ({share:.2f})" for name, share in list(faint.items())[:3])
+            self.warnings.append(f"{counted(len(faint), 'mask')} nowhere reach full coverage; the largest is "
+                                 f"{some}{' ...' if len(faint) > 3 else ''}: the object counts as half "
+                                 f"transparent; write masks that are white (255, 1.0) on the object.")
 
     def _box(self) -> np.ndarray:
         if self.config.box is not None:
@@ -193,14 +209,13 @@ class _Import:
         """The name of the copy, relative to the XML file."""
         if self.config.light is None:
             return None
-        try:
-            mi.Bitmap(str(self.config.light))
-        except Exception as error:
-            reason = (str(error).strip().splitlines() or [repr(error)])[0]
-            raise UserError(f"--light '{self.config.light}' cannot be read as an image ({reason}); give an "
-                            f"environment map such as an OpenEXR file.") from error
+        radiance = read_environment_map(self.config.light, "--light")
         name = "light" + self.config.light.suffix
-        shutil.copyfile(self.config.light, folder / name)
+        if is_exr(self.config.light):    # whatever its layers and windows are, Mitsuba reads the copy
+            name = "light.exr"
+            write_bitmap(mi.Bitmap(radiance), folder / name)
+        else:
+            shutil.copyfile(self.config.light, folder / name)
         return f"{self.output.stem}/{name}"
 
     def _view_record(self, name: str, frame: Frame, clipped: float) -> dict:
@@ -232,6 +247,20 @@ def _profile_warning(capture: Capture, config: CaptureConfig) -> list[str]:
         return []
     return [f"The photographs carry the colour profile '{profile}', but are read as sRGB: name their colour "
             f"space with --color-space."]
+
+
+def _turned_warning(capture: Capture) -> list[str]:
+    """If masks may be turned against photographs with an EXIF orientation, which their sizes do not tell."""
+    turned = [frame for frame in capture.frames
+              if frame.mask is not None and _is_ambiguous(exif_orientation(frame.image), frame.camera)]
+    if not turned:
+        return []
+    return [f"{counted(len(turned), 'photograph')} such as {turned[0].image.name} carry an EXIF orientation: "
+            f"their masks must be stored as their pixels are, not as viewers turn them."]
+
+
+def _is_ambiguous(orientation: int, camera: Camera) -> bool:
+    return orientation in (2, 3, 4) or (orientation > 4 and camera.width == camera.height)
 
 
 def to_scene(capture: Capture, up: str) -> np.ndarray:

@@ -62,7 +62,7 @@ def _check(output: Path, *, overwrite: bool, source: Path) -> None:
         raise UserError(f"The output '{output}' must end in .xml; the targets go into a folder of the same "
                         f"name beside it.")
     if trouble := name_trouble(output.name):
-        raise UserError(f"The output '{output}' {trouble}; choose another name.")
+        raise UserError(f"The name of the output '{str(output)[:80]}' {trouble}; choose another name.")
     own, folder = _own(output), output.with_suffix("")
     if folder.exists() and folder.resolve() in (source.resolve(), *source.resolve().parents):
         raise UserError(f"The output '{output}' would put its targets into '{folder}', where the capture is; "

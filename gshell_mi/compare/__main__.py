@@ -16,6 +16,7 @@ from ..command_line import run_command
 from ..errors import UserError
 from ..evaluation import IMAGE_SCORES
 from ..files import replacing
+from ..wording import counted
 
 _MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 
@@ -59,10 +60,15 @@ def _score(given: _Arguments) -> None:
         result = _compare(given)
         if given.json:
             with replacing(given.json) as partial:
-                partial.write_text(json.dumps(result, indent=1))
+                partial.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise UserError(f"'{error.filename or given.json or given.output}' cannot be written "
                         f"({error.strerror or error}); choose another place.") from error
+    unmatched = result.get("unmatched")
+    if unmatched:
+        some = ", ".join(unmatched[:3]) + (" ..." if len(unmatched) > 3 else "")
+        print(f"warning: {counted(len(unmatched), 'image')} without a partner of the same name not compared: "
+              f"{some}.", file=sys.stderr)
     _show(result)
 
 

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import trimesh
 from PIL import Image
@@ -14,6 +13,7 @@ from PIL import Image
 from ..errors import UserError
 from ..files import replacing
 from ..own_folder import own_folder
+from ..scene_files import load_scene
 from .atlas import unwrap
 from .bake import Textures, bake, project, vertex_tangents
 from .gltf import Part, write_glb
@@ -73,6 +73,9 @@ def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
     fine = read_ply(folder / "mesh.ply")
     if len(fine.faces) == 0:
         raise UserError(f"'{folder / 'mesh.ply'}' is empty; there is nothing to export.")
+    lacking = [name for name in ("color", "roughness", "metallic") if name not in fine.attributes]
+    if lacking:
+        raise UserError(f"'{folder / 'mesh.ply'}' has no {lacking[0]}; run the fit again, which writes it.")
     names = ["mesh.glb", *(_OBJ_FILES if config.obj else ())]
     if config.remesh is not None:
         names.append("remeshed.ply")
@@ -159,7 +162,7 @@ def _write_obj(folder: Path, vertices: np.ndarray, normals: np.ndarray, faces: n
     with replacing(folder / "mesh.mtl") as partial:
         partial.write_text(
             "newmtl subject\nKd 1 1 1\nillum 2\nmap_Kd mesh_base_color.png\nmap_Pr mesh_roughness.png\n"
-            "map_Pm mesh_metallic.png\nnorm mesh_normal.png\n")
+            "map_Pm mesh_metallic.png\nnorm mesh_normal.png\n", encoding="utf-8")
     # Welded: one position per point, or simulators would tear the object along the atlas's seams.
     welded, index = np.unique(vertices, axis=0, return_inverse=True)
     index = index.ravel()
@@ -170,7 +173,7 @@ def _write_obj(folder: Path, vertices: np.ndarray, normals: np.ndarray, faces: n
     corners = np.stack([index[faces], faces, faces], axis=-1) + 1
     lines += ["f " + " ".join(f"{p}/{t}/{n}" for p, t, n in face) for face in corners.tolist()]
     with replacing(folder / "mesh.obj") as partial:
-        partial.write_text("\n".join(lines) + "\n")
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -183,7 +186,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def y_up_turn(folder: Path) -> np.ndarray:
     """The rotation (3, 3) from the scene of the fit in ``folder`` to glTF's axes, y up; ``v @ turn.T``."""
     scene = folder / "scene.xml"
-    return _to_y_up(up_axis(mi.load_file(str(scene)).sensors()) if scene.is_file() else 1)
+    return _to_y_up(up_axis(load_scene(scene).sensors()) if scene.is_file() else 1)
 
 
 def _to_y_up(axis: int) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 from ..files import replacing
 from ..images import over_white, psnr, triptych, write_png
 from ..own_folder import OwnFolder
+from ..scene_files import load_scene
 from ..topology import topology
 from .ply import write_ply
 from .slivers import without_slivers
@@ -72,7 +73,7 @@ def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dic
     metrics = metrics | {"seconds": {**seconds, "total": round(sum(seconds.values()), 3)}}
     OwnFolder(output, "fit").claim("metrics.json")
     with replacing(output / "metrics.json") as partial:
-        partial.write_text(json.dumps(metrics, indent=1))
+        partial.write_text(json.dumps(metrics, indent=1), encoding="utf-8")
     return metrics
 
 
@@ -86,7 +87,7 @@ def _write_views(output: Path, fit: FitScene, shown: np.ndarray) -> dict[str, fl
     """Renders the exported scene from the views ``shown``; writes triptychs, returns PSNR by view id."""
     folder = output / "views"
     folder.mkdir(exist_ok=True)
-    scene = mi.load_file(str(output / "scene.xml"))
+    scene = load_scene(output / "scene.xml")
     integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
     scores = {}
     for index in shown:

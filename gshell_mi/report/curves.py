@@ -17,19 +17,21 @@ _ROW, _CHARACTERS = 14, 70
 
 
 def curves(log: Path) -> list[str]:
-    """One SVG per quantity: the losses of each stage on a logarithmic axis, and PSNR. Empty without a log;
-    lines of it that are no steps are left out."""
+    """One SVG per quantity: the losses of each stage on a logarithmic axis, and PSNR. Empty without a log.
+
+    Lines that no fit wrote are left out, and names are escaped.
+    """
     if not log.is_file():
         return []
-    stages: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for line in log.read_bytes().splitlines():
-        entry = _step(line)
+    stages: dict[str, dict[str, list[tuple[int, float]]]] = {}
+    for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
+        entry = _entry(line)
         if entry is None:
             continue
         stage = stages.setdefault(entry["stage"], {})
         for name, value in entry.items():
-            if name not in ("stage", "iteration", "seconds") and (number := _number(value)) is not None:
-                stage.setdefault(name, []).append((_number(entry["iteration"]), number))
+            if name not in ("stage", "iteration", "seconds") and _is_number(value):
+                stage.setdefault(name, []).append((entry["iteration"], value))
     drawings = []
     for stage, series in stages.items():
         losses = {name: values for name, values in series.items() if name != "psnr"}
@@ -39,29 +41,26 @@ def curves(log: Path) -> list[str]:
     return drawings
 
 
-def _step(line: bytes) -> dict | None:
-    """A line of the log, if it is a step of a stage."""
+def _entry(line: str) -> dict | None:
+    """One step of the log; None if the line holds none."""
     try:
         entry = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    known = isinstance(entry, dict) and isinstance(entry.get("stage"), str)
-    return entry if known and _number(entry.get("iteration")) is not None else None
-
-
-def _number(value: object) -> float | None:
-    try:
-        return float(value) if type(value) in (int, float) else None
-    except OverflowError:
+    if not isinstance(entry, dict) or not isinstance(entry.get("stage"), str):
         return None
+    return entry if _is_number(entry.get("iteration")) else None
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic: bool = False) -> str:
-    title = escape(title)
     points = {}
     for name, values in series.items():
         x, y = (np.array(column, float) for column in zip(*values, strict=True))
-        keep = np.isfinite(x) & np.isfinite(y) & ((y > 0) if logarithmic else True)
+        keep = np.isfinite(y) & ((y > 0) if logarithmic else True)
         if keep.any():
             points[name] = (x[keep], np.log10(y[keep]) if logarithmic else y[keep])
     if not points:
@@ -73,8 +72,8 @@ def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic
     down = lambda y: _TOP + (y_high - y) / y_span * (_HEIGHT - _TOP - _BOTTOM)  # noqa: E731
     legend = _legend(list(points)) if len(points) > 1 else []
     height = _HEIGHT + _ROW * len(legend)
-    parts = [f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{title}">',
-             f'<text x="{_LEFT}" y="14" class="title">{title}</text>']
+    parts = [f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escape(title)}">',
+             f'<text x="{_LEFT}" y="14" class="title">{escape(title)}</text>']
     for y in np.linspace(y_low, y_high, 4):
         label = f"{10 ** y:.2g}" if logarithmic else f"{y:.3g}"
         parts.append(f'<path class="grid" d="M{_LEFT} {down(y):.1f}H{_WIDTH - _RIGHT}"/>'

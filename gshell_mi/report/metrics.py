@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+from ..json_files import read_json
 
 #: The entries that a page cannot do without, and what they are.
 _NEEDED = {"scene": str, "psnr_training": float, "psnr_per_view": dict, "counts": dict, "seconds": dict,
@@ -30,8 +30,8 @@ def read_metrics(path: Path) -> dict[str, Any]:
         UserError: it is missing, no JSON, or not what a fit writes.
     """
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        metrics = read_json(path)
+    except (OSError, ValueError) as error:
         raise UserError(f"'{path}' is missing or no JSON; give the folder of a finished fit.") from error
     problem = _problem(metrics)
     if problem:

@@ -15,6 +15,7 @@ import numpy as np
 from markupsafe import Markup
 from PIL import Image
 
+from ..environment_maps import read_environment_map
 from ..errors import UserError
 from ..export.asset import write_asset
 from ..files import replacing
@@ -95,7 +96,7 @@ def _triptychs(folder: Path, count: int, metrics: dict) -> list[dict]:
     for path in (paths[i] for i in chosen):
         try:
             pixels = np.asarray(Image.open(path).convert("RGB"))
-        except (OSError, ValueError, Image.DecompressionBombError) as error:
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             raise UserError(f"'{path}' cannot be read as an image; remove it, or run the fit "
                             f"again.") from error
         width = pixels.shape[1] // 3
@@ -107,12 +108,8 @@ def _triptychs(folder: Path, count: int, metrics: dict) -> list[dict]:
 
 def _probe(path: Path) -> np.ndarray:
     """The light: its map, and a mirror ball and a grey ball in it, exposed alike; 8-bit."""
-    try:
-        light = mi.load_dict({"type": "envmap", "filename": str(path)})
-        bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
-    except RuntimeError as error:
-        raise UserError(f"'{path}' cannot be read as an environment map; run the fit again.") from error
-    radiance = np.array(bitmap)
+    radiance = read_environment_map(path, "Light")
+    light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(radiance)})
     size = _PROBE_HEIGHT
     sensor = {"type": "perspective", "fov": 30,
               "to_world": mi.ScalarTransform4f().look_at([0, 0.6, 4], [0, 0, 0], [0, 1, 0]),

@@ -104,6 +104,8 @@ def orbit(vertices: np.ndarray, axis: int, count: int, elevation: float, size: i
         origin = center + distance * toward
         yield mi.load_dict({
             "type": "perspective", "fov": _FOV,
+            # Mitsuba's own would be 0.01 and 10 000, whatever the object's units.
+            "near_clip": 1e-3 * float(distance), "far_clip": 1e3 * float(distance),
             "to_world": mi.ScalarTransform4f().look_at(list(origin), list(center), list(up)),
             "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba",
                      "rfilter": {"type": "box"}}})

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from ..errors import UserError
-from ..files import replacing
+from ..files import name_trouble, replacing
 from ..interrupt import check_interrupt
 from ..own_folder import TAG, check_own_file
 
@@ -28,8 +28,9 @@ def write_video(frames: Iterable[np.ndarray], path: Path, fps: float, *, gif: bo
         UserError: the files cannot be written, or something else is in their place.
     """
     path = Path(path)
-    if path.name in ("", ".."):
-        raise UserError(f"'{path}' is no name for a film; give one such as turntable.mp4 with -o.")
+    if trouble := name_trouble(path.name, in_scene=False):
+        raise UserError(f"The name of the film '{str(path)[:80]}' {trouble}; give one such as turntable.mp4 "
+                        f"with -o.")
     path = path.with_suffix(".mp4")
     files = [path, path.with_suffix(".gif")] if gif else [path]
     try:

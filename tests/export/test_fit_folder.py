@@ -148,12 +148,14 @@ def test_any_perspective_sensor_survives(exported, tmp_path, kind, crop):
     if crop:
         film |= {"crop_width": 20, "crop_height": 12, "crop_offset_x": 30, "crop_offset_y": 9}
     to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0.1, 0, 0], [0, 1, 0])
-    sensor = mi.load_dict(SENSORS[kind] | {"to_world": to_world, "film": film, "id": "view_007"})
+    sensor = mi.load_dict(SENSORS[kind] | {"to_world": to_world, "film": film, "id": 'view "7" & <8>',
+                                           "near_clip": 2e-6, "far_clip": 3e7})
     for name in ("mesh.ply", "light.exr"):
         (tmp_path / name).write_bytes((exported.output / name).read_bytes())
     write_scene(tmp_path / "scene.xml", exported.fit.light, [sensor])
     (written,) = mi.load_file(str(tmp_path / "scene.xml")).sensors()
-    assert written.id() == "view_007"
+    assert written.id() == 'view "7" & <8>'
+    assert (written.near_clip(), written.far_clip()) == pytest.approx((2e-6, 3e7))
     assert tuple(written.film().crop_size()) == tuple(sensor.film().crop_size())
     at = mi.Point2f(np.random.default_rng(3).random((2, 50)).astype(np.float32))
     ours, theirs = (s.sample_ray(0, 0.5, at, mi.Point2f(0.1, 0.8))[0] for s in (written, sensor))

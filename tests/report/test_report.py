@@ -152,7 +152,7 @@ def test_metrics_that_are_no_json(tmp_path, text):
 
 
 @pytest.mark.parametrize(("name", "words"), [
-    ("mesh.glb", "mesh.glb' cannot be read"),
+    ("mesh.glb", "mesh.glb' is damaged"),
     ("views/view_000.png", "view_000.png' cannot be read as an image"),
     ("light.exr", "light.exr"), ("mesh.ply", "mesh.ply")])
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: b"garbage", lambda data: data[:30]])

@@ -1,5 +1,7 @@
 """Turntables: what is seen from where, in which colours, and the files."""
 
+import re
+
 import imageio_ffmpeg
 import mitsuba as mi
 import numpy as np
@@ -95,6 +97,26 @@ def test_camera_keeps_the_fits_up_axis(up, tmp_path):
     assert np.ptp(origins @ np.array(up)) < 1e-5, "one height"
     center = origins.mean(0) * (1 - np.array(up))
     assert np.ptp(np.linalg.norm((origins - center) * (1 - np.array(up)), axis=1)) < 1e-4, "a circle"
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_objects_of_any_size_are_seen(scale):
+    vertices = scale * open_sphere(2).vertices
+    for sensor in orbit(vertices, 1, 3, 25.0, 16):
+        origin = np.array(mi.traverse(sensor)["to_world"].matrix).reshape(4, 4)[:3, 3]
+        distances = np.linalg.norm(vertices - origin, axis=1)
+        assert sensor.near_clip() < distances.min() and distances.max() < sensor.far_clip()
+
+
+@pytest.mark.parametrize("cut, words", [("sensor", "has no sensors"), ("emitter", "has no light"),
+                                        ("shape", "has no shape")])
+def test_scenes_that_no_fit_wrote(cut, words, tmp_path):
+    folder = write_fit(tmp_path, open_sphere(1), views=1, size=8)
+    text = (folder / "scene.xml").read_text(encoding="utf-8")
+    text = re.sub(rf"<{cut} .*</{cut}>", "", text, flags=re.DOTALL)
+    (folder / "scene.xml").write_text(text, encoding="utf-8")
+    with pytest.raises(UserError, match=words):
+        render_turntable(folder)
 
 
 def test_video_and_gif(tmp_path):
@@ -196,8 +218,9 @@ def test_command(folder, tmp_path, capsys):
     (("{fit}", "--channel", "albedo"), "--channel 'albedo' is unknown; choose one of shaded"),
     (("{fit}", "--envmap", "{none}"), "does not exist; check the path"),
     (("{fit}", "--envmap", "{fit}/scene.xml"), "cannot be read"),
-    (("{fit}", "-o", "..", "--frames", "1", "--size", "16"), "is no name for a film"),
-    (("{fit}", "-o", "/", "--frames", "1", "--size", "16"), "is no name for a film"),
+    (("{fit}", "-o", "..", "--frames", "1", "--size", "16"), "is no name; give one such as turntable.mp4"),
+    (("{fit}", "-o", "/", "--frames", "1", "--size", "16"), "is no name; give one such as turntable.mp4"),
+    (("{fit}", "-o", "x" * 300, "--frames", "1", "--size", "16"), "is longer than 200 bytes"),
     (("{fit}", "-o", "{fit}", "--frames", "1", "--size", "16"), "fit.mp4' exists and was not written by"),
     (("{fit}", "-o", "{fit}/mesh.ply/turn.mp4", "--frames", "1", "--size", "16"), "cannot be written"),
 ])
