@@ -23,16 +23,24 @@ class Target:
         rgba: (height, width, 4) float32, linear, premultiplied by alpha.
         has_alpha: False if the file had none and 1 was assumed everywhere.
         depth: (height, width) distances along the rays, world units, 0 where unknown; None without a map.
+        known: (height, width) float32 share of each pixel of which the target tells anything, 1 where it is
+            all; the rest may be the object or not, and of any colour.
     """
 
     path: Path
     rgba: np.ndarray
     has_alpha: bool
     depth: np.ndarray | None = None
+    known: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.known is None:
+            object.__setattr__(self, "known", np.ones(self.rgba.shape[:2], np.float32))
 
 
 def load_target(path: Path, width: int, height: int) -> Target:
-    """Reads one target, with the depth map beside it if there is one, and checks that a fit can use it.
+    """Reads one target, with the depth map and the file of what is known of it beside it if there are such,
+    and checks that a fit can use it.
 
     Raises:
         UserError: the file is missing or unreadable, has another size than its sensor's film, holds
@@ -69,7 +77,41 @@ def load_target(path: Path, width: int, height: int) -> Target:
                         f"alpha is coverage and lies between 0 and 1.")
     pixels[..., 3] = np.clip(alpha, 0.0, 1.0)
     depth = path.with_suffix(".depth.exr")
-    return Target(path, pixels, has_alpha, load_depth(depth, width, height) if depth.is_file() else None)
+    known = path.with_suffix(".known.exr")
+    return Target(path, pixels, has_alpha, load_depth(depth, width, height) if depth.is_file() else None,
+                  load_known(known, width, height) if known.is_file() else None)
+
+
+def load_known(path: Path, width: int, height: int) -> np.ndarray:
+    """Reads what is known of a target: per pixel 1 where it tells whether and what it shows of the object, 0
+    where it tells nothing, such as behind an occluder, where a mask is in doubt or beyond the photograph's
+    frame.
+
+    Returns:
+        (height, width) float32 in [0, 1].
+
+    Raises:
+        UserError: the file is unreadable, has another size than its sensor's film, more than one channel, or
+            values that are no shares.
+    """
+    try:
+        known = np.array(mi.Bitmap(str(path)), np.float32)
+    except Exception as error:
+        raise UserError(f"'{path}' cannot be read as an image ({_first_line(error)}); write it again as an "
+                        f"OpenEXR file.") from error
+    known = known.reshape(*known.shape[:2], -1)
+    if known.shape[2] > 1 and (known != known[..., :1]).any():
+        raise UserError(f"'{path}' has {known.shape[2]} different channels; write one, 1 where the target is "
+                        f"known.")
+    known = known[..., 0]
+    if known.shape != (height, width):
+        found_height, found_width = known.shape
+        raise UserError(f"'{path}' is {found_width} x {found_height} pixels, but its sensor's film is "
+                        f"{width} x {height}; resize one of them.")
+    if not (np.isfinite(known).all() and known.min() >= 0 and known.max() <= 1):
+        raise UserError(f"'{path}' has values that are no shares; write 1 where the target is known and 0 "
+                        f"where it is not.")
+    return known
 
 
 def load_depth(path: Path, width: int, height: int) -> np.ndarray:

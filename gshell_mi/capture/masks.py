@@ -11,6 +11,7 @@ from PIL import ImageColor
 from ..errors import UserError
 from .decoding import SUFFIXES, images_in, read_pixels
 from .frames import Capture, Frame
+from .reduced import match_size
 
 #: Folders that data sets keep masks in, beside the images' folder or in the capture's.
 _FOLDERS = ("masks", "mask")
@@ -116,28 +117,30 @@ def _match(folder: Path, image: Path) -> Path | None:
 
 
 def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None = None, *,
-                inverted: bool = False) -> np.ndarray:
+                inverted: bool = False, reduction: int = 1) -> np.ndarray:
     """(h, w) coverage in [0, 1] of a frame with the given stored pixels.
 
     A given background colour comes first, then the frame's mask, then alpha.
 
     Args:
         inverted: mask files are black on the object.
+        reduction: of the pixels, see ``read_reduced``.
 
     Raises:
-        UserError: there is none of them, or the mask has another size than the image.
+        UserError: there is none of them, or the mask has another aspect than the image.
     """
     if background is not None:
         return background.coverage(_unit(pixels[..., :3])).astype(np.float32)
     if frame.mask is not None:
         mask = read_pixels(frame.mask)
-        if mask.shape[:2] != pixels.shape[:2]:
-            raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "
-                            f"is {pixels.shape[1]} x {pixels.shape[0]}; resize it.")
         # Some tools put the mask into alpha and leave the colour empty or as it was.
         in_alpha = mask.shape[2] == 4 and _unit(mask[..., 3]).min() < 1
         values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
-        coverage = np.clip(_unit(values, mask.dtype), 0, 1)
+        size = (frame.camera.width, frame.camera.height)
+        coverage = match_size(np.clip(_unit(values, mask.dtype), 0, 1), size, pixels.shape[:2], reduction)
+        if coverage is None:
+            raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "
+                            f"is {size[0]} x {size[1]}; resize it.")
         return 1 - coverage if inverted else coverage
     if pixels.shape[2] < 4:
         raise UserError(f"Image '{frame.image}' has no alpha, and there is no mask for it; {_SUPPLY}.")

@@ -12,16 +12,19 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
+from .acquire import acquire, lacks_masks, make_masks
 from .camera import Camera
 from .config import AXES, CaptureConfig
-from .decoding import ColorDecoding, color_profile
-from .formats import read_capture
+from .decoding import FLOAT_SUFFIXES, ColorDecoding, color_profile
+from .evidence import assign_ignored
 from .frames import Capture, Frame
 from .masks import Background, assign_masks
+from .parallel import in_order
 from .prepare import Preparation, exposure_gains
 from .region import FLIPPED_AXES, find_box, likely_misreading
 from .trouble import Thumbnail, find_trouble
-from .writer import scene_xml, sensors_xml, staged, write_record, write_target
+from .workspace import Progress
+from .writer import scene_xml, sensors_xml, staged, write_known, write_record, write_target
 
 #: An object farther from the origin than so many of its sizes is moved there.
 _FAR = 50.0
@@ -36,6 +39,7 @@ class CaptureResult:
         training, held_out: numbers of views.
         box: (2, 3) corners of the lattice's cube, in the scene.
         warnings: what is likely wrong, a sentence each.
+        made: what was made because it was not there: "cameras", "masks".
     """
 
     path: Path
@@ -43,24 +47,30 @@ class CaptureResult:
     held_out: int
     box: np.ndarray
     warnings: tuple[str, ...]
+    made: tuple[str, ...] = ()
 
 
 def import_capture(source: str | Path, output: str | Path, *, config: CaptureConfig | None = None,
                    overwrite: bool = False,
-                   progress: Callable[[int, int], None] | None = None) -> CaptureResult:
-    """Turns photographs with known cameras into a fit scene.
+                   progress: Callable[[int, int], None] | None = None,
+                   steps: Progress | None = None) -> CaptureResult:
+    """Turns photographs into a fit scene; cameras and masks that they lack are made.
 
     A Mitsuba ``llvm`` or ``cuda`` variant must be set. Writes ``output`` (an XML file) and beside it the
     folder of its stem: targets ``view_000.exr`` and so on, ``sensors.xml``, ``capture.json`` (which view is
     which photograph, how the world was moved) and, if there are held-out views, ``test.xml`` with
-    ``test/test_000.exr`` and so on. Either all of that or, on an error, nothing.
+    ``test/test_000.exr`` and so on. Either all of that or, on an error, nothing. Cameras, masks and the
+    frames of a video are kept in a folder beside it, whose name ends in ``.work``, from where a second call
+    takes them.
 
     Args:
-        source: the capture's folder or main file.
+        source: the capture's folder or main file, a folder of photographs, or a video.
         output: the fit scene to write.
         config: see ``CaptureConfig``.
         overwrite: replace what an earlier import wrote.
         progress: called with (photographs done, photographs).
+        steps: called with (what, done, in all) in the steps before, which only captures without cameras or
+            masks have.
 
     Raises:
         UserError: of anything in the capture or the options that the user can mend.
@@ -68,21 +78,23 @@ def import_capture(source: str | Path, output: str | Path, *, config: CaptureCon
     config = config or CaptureConfig()
     source, output = Path(source), Path(output)
     with staged(output, overwrite=overwrite, source=source) as partial:
-        return _Import(source, output, config, progress).write(partial)
+        return _Import(source, output, config, progress, steps).write(partial)
 
 
 class _Import:
     def __init__(self, source: Path, output: Path, config: CaptureConfig,
-                 progress: Callable[[int, int], None] | None):
+                 progress: Callable[[int, int], None] | None, steps: Progress | None):
         self.config, self.output, self.progress = config, output, progress
         decoding = ColorDecoding(config.color_space, config.transfer)
         background = None
-        if config.background is not None:
+        if config.background is not None and not Path(config.background).is_file():
             background = Background.parse(config.background, config.background_tolerance)
-        capture = read_capture(source, format=config.format, images=config.images,
-                               opencv_axes=config.opencv_axes)
+        acquired = acquire(source, output, config, steps)
         if background is None:
-            capture = assign_masks(capture, config.masks)
+            acquired.capture = assign_masks(acquired.capture, config.masks)
+            if config.make_masks != "off" and lacks_masks(acquired.capture):
+                make_masks(acquired, config, lambda capture: to_scene(capture, config.up), steps)
+        capture, self.made = assign_ignored(acquired.capture, config.ignore), tuple(acquired.made)
         if config.hold_out:
             capture = capture.holding_out(config.hold_out)
         if not capture.training:
@@ -92,7 +104,7 @@ class _Import:
             replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames))
         gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
         self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains)
-        self.warnings = _profile_warning(capture, config)
+        self.warnings = [*capture.notes, *_profile_warning(capture, config)]
         self.cameras: dict[str, Camera] = {}
         self.tests: dict[str, Camera] = {}
         self.thumbnails: list[Thumbnail] = []
@@ -111,25 +123,30 @@ class _Import:
         document = scene_xml(stem, box, self.config.resolution, self._copy_light(folder))
         (partial / self.output.name).write_text(document, encoding="utf-8")
         write_record(folder, self._record(box))
-        return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings))
+        return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings),
+                             self.made)
 
     def _write_targets(self, folder: Path) -> None:
-        empty = []
-        for index, frame in enumerate(self.capture.frames):
-            target = self.preparation.target(frame)
+        empty, frames = [], self.capture.frames
+        # Mitsuba's reader of floating point files has threads of its own.
+        threads = 1 if any(frame.image.suffix.lower() in FLOAT_SUFFIXES for frame in frames) else None
+        targets = in_order(self.preparation.target, frames, threads=threads)
+        for index, (frame, target) in enumerate(zip(frames, targets, strict=True)):
             if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
                 empty.append(frame.image.name)    # it would carve away everything that it frames
                 continue
             name = f"test_{len(self.tests):03}" if frame.held_out else f"view_{len(self.cameras):03}"
+            place = folder / "test" if frame.held_out else folder
+            place.mkdir(exist_ok=True)
+            write_target(place / f"{name}.exr", target.rgba)
+            if target.known is not None:
+                write_known(place / f"{name}.exr", target.known)
             if frame.held_out:
-                (folder / "test").mkdir(exist_ok=True)
-                write_target(folder / "test" / f"{name}.exr", target.rgba)
                 self.tests[name] = target.camera
             else:
-                write_target(folder / f"{name}.exr", target.rgba)
                 self.cameras[name] = target.camera
-                label = f"{name} ({frame.image.name})"
-                self.thumbnails.append(Thumbnail.of(label, target.rgba, target.camera, target.clipped))
+                self.thumbnails.append(Thumbnail.of(f"{name} ({frame.image.name})", target.rgba,
+                                                    target.camera, target.clipped, target.known))
             self.views.append(self._view_record(name, frame, target.clipped))
             if self.progress:
                 self.progress(index + 1, len(self.capture.frames))
