@@ -11,7 +11,7 @@ from PIL import ImageColor
 from ..errors import UserError
 from .decoding import SUFFIXES, images_in, read_pixels
 from .frames import Capture, Frame
-from .reduced import match_size
+from .reduced import match_size, read_reduced_grey
 
 #: Folders that data sets keep masks in, beside the images' folder or in the capture's.
 _FOLDERS = ("masks", "mask")
@@ -131,12 +131,15 @@ def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None 
     """
     if background is not None:
         return background.coverage(_unit(pixels[..., :3])).astype(np.float32)
+    size = (frame.camera.width, frame.camera.height)
     if frame.mask is not None:
+        grey = read_reduced_grey(frame.mask, size, reduction)
+        if grey is not None:
+            return 1 - grey if inverted else grey
         mask = read_pixels(frame.mask)
         # Some tools put the mask into alpha and leave the colour empty or as it was.
         in_alpha = mask.shape[2] == 4 and _unit(mask[..., 3]).min() < 1
         values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
-        size = (frame.camera.width, frame.camera.height)
         coverage = match_size(np.clip(_unit(values, mask.dtype), 0, 1), size, pixels.shape[:2], reduction)
         if coverage is None:
             raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "

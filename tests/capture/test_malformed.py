@@ -175,7 +175,7 @@ CASES = {
     "a mask missing": ("colmap", remove("masks/IMG 02.png.png"), [], "IMG 02.png' has no mask"),
     "no masks": ("colmap", remove("masks"), ["--make-masks", "off"], "supply images with alpha"),
     "unknown maker of masks": ("nerf", nothing, ["--make-masks", "magic"], "choose grabcut, rembg or off"),
-    "no frames": ("nerf", nothing, ["--frames", "1"], "--frames"),
+    "too few frames of a video": ("nerf", nothing, ["--frames", "1"], "--frames"),
     "ignore folder missing": ("nerf", nothing, ["--ignore", "nowhere"], "correct --ignore"),
     "ignore masks of other names": ("nerf", nothing, ["--ignore", "{source}"], "named like an image"),
     "known file of another kind": ("colmap", write("ignore/IMG 01.png", b"white"), [], "cannot be read"),
