@@ -18,7 +18,7 @@ def read_reduced(path: Path, longest: int) -> tuple[np.ndarray, int]:
     """The pixels of an image file, and by how much it was reduced while it was decoded.
 
     Only JPEG files are, by 2, 4 or 8, to no less than ``longest`` pixels on the longer side. A pixel is then
-    the mean of a block of encoded values; the last of a row or column may be of fewer.
+    the mean of a block of encoded values; what does not fill a block at the right and the bottom is cut off.
 
     Args:
         path: as for ``read_pixels``.
@@ -39,7 +39,7 @@ def read_reduced(path: Path, longest: int) -> tuple[np.ndarray, int]:
             image.draft(image.mode, wanted)
             if image.size != tuple(-(-size // reduction) for size in before):
                 return read_pixels(path), 1
-            pixels = np.array(image)
+            pixels = np.array(image)[:wanted[1], :wanted[0]]
     except (OSError, SyntaxError, ValueError):
         return read_pixels(path), 1    # which tells what is wrong with the file
     return (np.stack([pixels] * 3, axis=-1) if pixels.ndim == 2 else pixels), reduction
@@ -50,11 +50,11 @@ def reduced_camera(camera: Camera, reduction: int) -> Camera:
 
     >>> small = reduced_camera(Camera(9, 8, 8.0, 8.0, 4.5, 4.0, np.eye(4)), 4)
     >>> small.width, small.height, small.fx, small.cx
-    (3, 2, 2.0, 1.125)
+    (2, 2, 2.0, 1.125)
     """
     if reduction == 1:
         return camera
-    return replace(camera, width=-(-camera.width // reduction), height=-(-camera.height // reduction),
+    return replace(camera, width=camera.width // reduction, height=camera.height // reduction,
                    fx=camera.fx / reduction, fy=camera.fy / reduction, cx=camera.cx / reduction,
                    cy=camera.cy / reduction)
 
@@ -70,7 +70,8 @@ def read_reduced_grey(path: Path, size: tuple[int, int], reduction: int) -> np.n
         with Image.open(path) as image:
             if reduction == 1 or image.size != size or image.mode not in ("1", "L"):
                 return None
-            return np.array(image.convert("L").reduce(reduction), np.float32) / 255
+            box = (0, 0, *(side // reduction * reduction for side in size))
+            return np.array(image.convert("L").reduce(reduction, box), np.float32) / 255
     except (OSError, SyntaxError, ValueError):
         return None    # reading it in full tells what is wrong
 

@@ -7,7 +7,7 @@ the object is its visual hull; its image in each view says what is certain there
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -24,6 +24,8 @@ from .workspace import Progress
 SIZE = 500
 #: Per round: by how much the images are reduced, and the voxels along the longest side of the box.
 _ROUNDS = ((2, 48), (2, 64), (1, 80))
+#: The box grows on the sides that the first hull reaches, by this share of its size, so many times.
+_GROWTH, _GROWTHS = 0.2, 4
 #: Share of the views that may call a voxel of the object background.
 _DISSENT = 0.12
 #: Cuts of a view are trusted up to so many voxels from the hull's outline.
@@ -79,17 +81,29 @@ def cut_out(views: list[View], subject: Subject, progress: Progress | None = Non
     except ImportError:
         raise UserError("The photographs have no masks, and making them takes OpenCV: install it with `pip "
                         "install 'gshell_mi[masks]'`, or supply masks.") from None
-    masks: list[np.ndarray | None] = [None] * len(views)
-    reduced = views
-    for round, (reduction, voxels) in enumerate(_ROUNDS):
-        grid = _Voxels(subject, voxels)
-        hull = None if round == 0 else _hull(grid, reduced, masks)
-        reduced = [view.reduced(reduction) for view in views]
-        cuts = in_order(partial(_cut, subject, grid, hull), list(zip(reduced, masks, strict=True)))
-        for index, mask in enumerate(cuts):
+    done = 0
+
+    def cut(reduction: int, grid: _Voxels, hull: np.ndarray | None,
+            masks: list[np.ndarray | None]) -> tuple[list[View], list[np.ndarray]]:
+        nonlocal done
+        reduced, cuts = [view.reduced(reduction) for view in views], []
+        for mask in in_order(partial(_cut, subject, grid, hull), list(zip(reduced, masks, strict=True))):
+            cuts.append(mask)
+            done = min(done + 1, len(_ROUNDS) * len(views))
             if progress:
-                progress("masks", round * len(views) + index + 1, len(_ROUNDS) * len(views))
-            masks[index] = mask
+                progress("masks", done, len(_ROUNDS) * len(views))
+        return reduced, cuts
+
+    for _ in range(_GROWTHS):
+        grid = _Voxels(subject, _ROUNDS[0][1])
+        reduced, masks = cut(_ROUNDS[0][0], grid, None, [None] * len(views))
+        grown = grid.grown(_hull(grid, reduced, masks))
+        if (grown == subject.box).all():
+            break
+        subject, done = replace(subject, box=grown), 0
+    for reduction, voxels in _ROUNDS[1:]:
+        grid = _Voxels(subject, voxels)
+        reduced, masks = cut(reduction, grid, _hull(grid, reduced, masks), masks)
     hull = _hull(grid, reduced, masks)
     return [_tidied(mask, grid.seen_by(view.camera, hull)) for view, mask in zip(views, masks, strict=True)]
 
@@ -115,7 +129,8 @@ class _Voxels:
     """The box as a grid of voxels above the floor."""
 
     def __init__(self, subject: Subject, count: int):
-        low, high = subject.box
+        self.box = subject.box
+        low, high = self.box
         self.size = float(np.ptp(subject.box, axis=0).max()) / count
         axes = [np.arange(a + self.size / 2, b, self.size) for a, b in zip(low, high, strict=True)]
         self.shape = tuple(len(axis) for axis in axes)
@@ -149,6 +164,16 @@ class _Voxels:
             volume[0] = 0
             kept &= (volume >= 0.02 * volume.max())[label].ravel()
         return kept
+
+    def grown(self, surface: np.ndarray) -> np.ndarray:
+        """(2, 3) the box, larger on the sides that the voxels at a hull's surface reach."""
+        filled = surface.reshape(self.shape)
+        box = self.box.copy()
+        for axis in range(3):
+            for side, layer in enumerate((0, -1)):
+                if filled.take(layer, axis=axis).any():
+                    box[side, axis] += (2 * side - 1) * _GROWTH * np.ptp(self.box, axis=0).max()
+        return box
 
     def surface(self, which: np.ndarray) -> np.ndarray:
         """(n,) those of the chosen voxels that are not wholly among others."""

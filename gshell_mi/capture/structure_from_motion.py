@@ -66,7 +66,8 @@ def place(photographs: list[Path], source: Path, workspace: Workspace, *, sequen
     sequential = sequential or len(photographs) > _ALL_PAIRS
     job = {"photographs": fingerprint(photographs), "sequential": sequential, **_lens(photographs),
            "images": [f"{index:05}.jpg" for index in range(len(photographs))],
-           "features": _FEATURES, "size": _SIZE}
+           "features": _FEATURES,
+           "size": max(max(_scaled(image_size(path), _SIZE)) for path in photographs)}
     folder = workspace.step("colmap", job)
     if not (folder / "models").is_dir():
         _write_copies(photographs, folder / "images", progress)

@@ -18,6 +18,8 @@ _FEW = 30
 _FLAT = 0.02
 #: A plane needs this share of the points; of the rest, as much above it, and no more below.
 _PLANE, _ABOVE, _BELOW = 0.08, 0.1, 0.1
+#: Smaller clusters than this share of the object's points are left out.
+_CLUSTER = 0.03
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def find_subject(cameras: list[Camera], points: np.ndarray) -> Subject | None:
     floor = _floor(near, cameras, radius)
     height = near @ floor[:3] + floor[3] if floor is not None else None
     on_object = near if floor is None else near[height > 2 * _FLAT * radius]
-    on_object = _largest_cluster(on_object)
+    on_object = _clusters(on_object)
     low, high = on_object.min(axis=0), on_object.max(axis=0)
     room = 0.2 * np.ptp(on_object, axis=0).max()
     return Subject(np.stack([low - room, high + room]), on_object, floor)
@@ -139,12 +141,13 @@ def _support(points: np.ndarray, plane: np.ndarray, radius: float) -> int:
     return int((np.abs(height) < _FLAT * radius).sum()) if fits else 0
 
 
-def _largest_cluster(points: np.ndarray) -> np.ndarray:
-    """The points that hang together; single ones far off are mistakes of the matching."""
+def _clusters(points: np.ndarray) -> np.ndarray:
+    """The points in clusters of some size; few that are far off are mistakes of the matching."""
     distance = cKDTree(points).query(points, k=min(4, len(points)))[0][:, -1]
     pairs = cKDTree(points).sparse_distance_matrix(cKDTree(points), 6 * np.median(distance), p=2)
     label = connected_components(pairs, directed=False)[1]
-    return points[label == np.bincount(label).argmax()]
+    size = np.bincount(label)
+    return points[size[label] >= _CLUSTER * len(points)]
 
 
 def sparse_points(model: Path, shortest: int = 3) -> np.ndarray:

@@ -77,7 +77,8 @@ def _frames(video: Path, pixels: str, options: list[str]):
     """
     try:
         # No "-vsync": every frame that is stored counts once, whatever its time.
-        yield from imageio_ffmpeg.read_frames(str(video), pix_fmt=pixels, output_params=options)
+        yield from imageio_ffmpeg.read_frames(str(video), pix_fmt=pixels, output_params=options,
+                                              bits_per_pixel=8 if pixels == "gray" else 24)
     except (OSError, RuntimeError, KeyError, IndexError) as error:
         reason = ([line for line in str(error).splitlines() if line.strip()] or [repr(error)])[-1].strip()
         raise UserError(f"Video '{video}' cannot be read ({reason}); convert it to MP4 again.") from error
