@@ -106,7 +106,7 @@ def make_masks(acquired: Acquired, config: CaptureConfig, to_scene: Callable[[Ca
     if config.box is not None:
         subject = _boxed(subject, np.array(config.box).reshape(2, 3), to_scene(capture))
     elif capture.region is not None:
-        subject = Subject(capture.region, points[:0])
+        subject = Subject(capture.region, points[:0], core=_core(capture.region))
     if subject is None:
         raise UserError(f"The cameras of '{capture.source}' look at no common point, so masks cannot be "
                         f"made; supply them with --masks, or give --box.")
@@ -137,9 +137,13 @@ def _boxed(subject: Subject | None, box: np.ndarray, to_scene: np.ndarray) -> Su
     corners = (corners - to_scene[:3, 3]) @ to_scene[:3, :3]
     around = np.stack([corners.min(axis=0), corners.max(axis=0)])
     if subject is None:
-        return Subject(around, np.zeros((0, 3)))
+        return Subject(around, np.zeros((0, 3)), core=_core(around))
     inside = ((subject.points > around[0]) & (subject.points < around[1])).all(axis=1)
-    return Subject(around, subject.points[inside], subject.floor)
+    return Subject(around, subject.points[inside], subject.floor, _core(around))
+
+
+def _core(box: np.ndarray) -> tuple[np.ndarray, float]:
+    return box.mean(axis=0), 0.3 * float(np.ptp(box, axis=0).min())
 
 
 def _with_priors(views: list[View], config: CaptureConfig) -> list[View]:

@@ -19,8 +19,8 @@ from .reduced import match_size
 
 #: Folder that is looked for beside the images.
 FOLDER = "ignore"
-#: Values between these are grey.
-_GREY = (0.02, 0.98)
+#: Values between these are grey; JPEG masks are a little off black and white around outlines.
+_GREY = (0.1, 0.9)
 #: Grey areas narrower than this share of the longer side, and than so many pixels, are coverage.
 _WIDE, _WIDE_PIXELS = 0.01, 5
 

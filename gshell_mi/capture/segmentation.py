@@ -165,6 +165,10 @@ class _Voxels:
             kept &= (volume >= 0.02 * volume.max())[label].ravel()
         return kept
 
+    def within(self, center: np.ndarray, radius: float) -> np.ndarray:
+        """(n, 3) the centres of the voxels of a ball above the floor."""
+        return self.points[self.allowed & (np.linalg.norm(self.points - center, axis=1) < radius)]
+
     def grown(self, surface: np.ndarray) -> np.ndarray:
         """(2, 3) the box, larger on the sides that the voxels at a hull's surface reach."""
         filled = surface.reshape(self.shape)
@@ -207,6 +211,8 @@ def _trimap(view: View, subject: Subject, grid: _Voxels, hull: np.ndarray | None
     result = np.full(boxed.shape, cv2.GC_PR_BGD, np.uint8)
     if hull is None:
         result[_solid(camera, subject.points)] = cv2.GC_PR_FGD
+        if subject.core is not None:
+            result[_solid(camera, grid.within(*subject.core))] = cv2.GC_PR_FGD
         if view.prior is not None:
             result[view.prior >= 0.5] = cv2.GC_PR_FGD
             result[view.prior < 0.5] = cv2.GC_PR_BGD
@@ -223,16 +229,14 @@ def _trimap(view: View, subject: Subject, grid: _Voxels, hull: np.ndarray | None
 
 
 def _solid(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """(height, width) the convex hull of the points' image; without points, the middle of the frame."""
+    """(height, width) the convex hull of the points' image."""
     import cv2
 
     result = np.zeros((camera.height, camera.width), np.uint8)
     if len(points) >= 3:
-        outline = cv2.convexHull(camera.project(points).astype(np.float32)).astype(np.int32)
+        pixels = np.clip(camera.project(points), -1e4, 1e4).astype(np.float32)
+        outline = cv2.convexHull(pixels).astype(np.int32)
         cv2.fillConvexPoly(result, outline, 1)
-    else:
-        center = (camera.width // 2, camera.height // 2)
-        cv2.ellipse(result, center, (camera.width // 4, camera.height // 4), 0, 0, 360, 1, -1)
     return result > 0
 
 

@@ -20,6 +20,8 @@ _FLAT = 0.02
 _PLANE, _ABOVE, _BELOW = 0.08, 0.1, 0.1
 #: Smaller clusters than this share of the object's points are left out.
 _CLUSTER = 0.03
+#: Radius of the core, as a share of that of the sphere that the frames hold.
+_CORE = 0.4
 
 
 @dataclass(frozen=True)
@@ -28,14 +30,17 @@ class Subject:
 
     Attributes:
         box: (2, 3) corners, in the capture's world, of a box that holds the object with some room.
-        points: (n, 3) points on the object; none if there are too few to tell.
+        points: (n, 3) points on the object, of its textured parts; none if there are too few to tell.
         floor: (4,) unit normal, towards the cameras, and offset of the plane that it stands on: ``normal .
             x + offset`` is a point's height; None if there is none.
+        core: centre (3,) and radius of a ball about what the cameras look at, much of it the object; None if
+            nobody knows.
     """
 
     box: np.ndarray
     points: np.ndarray
     floor: np.ndarray | None = None
+    core: tuple[np.ndarray, float] | None = None
 
     @property
     def up(self) -> np.ndarray | None:
@@ -56,16 +61,20 @@ def find_subject(cameras: list[Camera], points: np.ndarray) -> Subject | None:
     if center is None:
         return None
     radius = _framed(cameras, center)
+    box, core = np.stack([center - radius, center + radius]), (center, _CORE * radius)
     near = points[np.linalg.norm(points - center, axis=1) < radius] if len(points) else points
     if len(near) < _FEW:
-        return Subject(np.stack([center - radius, center + radius]), near[:0])
+        return Subject(box, near[:0], core=core)
     floor = _floor(near, cameras, radius)
     height = near @ floor[:3] + floor[3] if floor is not None else None
     on_object = near if floor is None else near[height > 2 * _FLAT * radius]
+    if len(on_object) < _FEW:
+        return Subject(box, on_object[:0], floor, core)
     on_object = _clusters(on_object)
     low, high = on_object.min(axis=0), on_object.max(axis=0)
-    room = 0.2 * np.ptp(on_object, axis=0).max()
-    return Subject(np.stack([low - room, high + room]), on_object, floor)
+    room = 0.1 * np.ptp(on_object, axis=0).max()
+    box = np.stack([np.minimum(box[0], low - room), np.maximum(box[1], high + room)])
+    return Subject(box, on_object, floor, core)
 
 
 def _looked_at(cameras: list[Camera]) -> np.ndarray | None:

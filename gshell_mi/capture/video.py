@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -69,14 +71,16 @@ def choose(sharpness: np.ndarray, change: np.ndarray, count: int) -> np.ndarray:
                      for members in (np.flatnonzero(stretch == k) for k in range(count)) if len(members)])
 
 
-def _frames(video: Path, pixels: str, options: list[str]):
-    """The properties of a video, then its frames as bytes.
+def _frames(video: Path, pixels: str, options: list[str]) -> Iterator:
+    """The properties of a video, then its frames as bytes; ``-fps_mode passthrough`` among the options gives
+    each stored frame once, whatever its time.
 
     Raises:
         UserError: ffmpeg cannot read it.
     """
+    # It warns of frames that are asked for in another size.
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     try:
-        # No "-vsync": every frame that is stored counts once, whatever its time.
         yield from imageio_ffmpeg.read_frames(str(video), pix_fmt=pixels, output_params=options,
                                               bits_per_pixel=8 if pixels == "gray" else 24)
     except (OSError, RuntimeError, KeyError, IndexError) as error:

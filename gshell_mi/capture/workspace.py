@@ -13,7 +13,8 @@ from ..files import replacing
 #: Called with (what is being done, steps done, steps in all).
 Progress = Callable[[str, int, int], None]
 
-_MARK = "gshell_mi.json"
+#: Tells that a folder was made here.
+_MARK = "steps.json"
 
 
 class Workspace:
@@ -59,4 +60,4 @@ class Workspace:
 
 def fingerprint(files: list[Path]) -> list[list]:
     """What tells a changed file: name, size and time of change of each."""
-    return [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in files]
+    return [[str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns] for path in files]

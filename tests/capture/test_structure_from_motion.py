@@ -141,7 +141,7 @@ def test_a_video_becomes_a_scene(tmp_path, variant):
     assert main([str(video), "-o", str(tmp_path / "s.xml"), "--quiet", "--variant", variant,
                  "--frames", "24"]) == 0
     assert len(load_fit_scene(tmp_path / "s.xml").sensors) >= 22
-    assert "gshell_mi.capture" in (tmp_path / "s.work" / "gshell_mi.json").read_text()
+    assert "gshell_mi.capture" in (tmp_path / "s.work" / "steps.json").read_text()
 
 
 def test_interrupt_ends_the_worker(tmp_path, monkeypatch):
