@@ -77,7 +77,7 @@ class Carving:
 
     A point is kept if no view excludes it by more than ``slack``, so that a coarse grid misses nothing
     thin. A view excludes what falls beside its mask and what is unknown there, and what it does not frame if
-    these keep clear of the border, for then it shows the whole object. Daylight that a mask encloses
+    its mask keeps clear of the border, for then it shows the whole object. Daylight that a mask encloses
     excludes nothing, as in ``fields.visual_hull``.
     """
 
@@ -85,7 +85,8 @@ class Carving:
         self._views = []
         for silhouette in silhouettes:
             inside = ndimage.binary_fill_holes(silhouette.possible >= 0.5)
-            whole = not (inside[[0, -1]].any() or inside[:, [0, -1]].any())
+            mask = silhouette.alpha >= 0.5
+            whole = not (mask[[0, -1]].any() or mask[:, [0, -1]].any())
             self._views.append((silhouette.camera, ndimage.distance_transform_edt(~inside), whole))
 
     def keeps(self, points: np.ndarray, slack: float) -> np.ndarray:

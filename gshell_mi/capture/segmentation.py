@@ -28,6 +28,12 @@ _ROUNDS = ((2, 48), (2, 64), (1, 80))
 _GROWTH, _GROWTHS = 0.2, 4
 #: Share of the views that may call a voxel of the object background.
 _DISSENT = 0.12
+#: OpenCV's codes of a guess.
+_UNLIKELY, _LIKELY = 2, 3
+#: A first cut that keeps less than this share of the guess has lost the object.
+_LOST = 0.5
+#: So does one of less than this share of the median's area.
+_TINY = 0.1
 #: Cuts of a view are trusted up to so many voxels from the hull's outline.
 _BAND = 3.0
 #: What is nearer to the floor than this share of the box may be floor.
@@ -122,7 +128,13 @@ def _cut(subject: Subject, grid: _Voxels, hull: np.ndarray | None,
     view, mask = work
     if mask is not None:
         mask = _resized(mask, view.image.shape[1::-1])
-    return _grab_cut(view.image, _trimap(view, subject, grid, hull, mask))
+    trimap = _trimap(view, subject, grid, hull, mask)
+    cut = _grab_cut(view.image, trimap)
+    guessed = trimap == _LIKELY
+    if hull is None and cut.sum() < _LOST * guessed.sum():
+        # The guess was too small: the object's colours went to the background. All of the box, then.
+        cut = _grab_cut(view.image, np.where(trimap == _UNLIKELY, _LIKELY, trimap).astype(np.uint8))
+    return cut
 
 
 class _Voxels:
@@ -150,10 +162,16 @@ class _Voxels:
         return np.where(framed, v, 0).astype(int), np.where(framed, u, 0).astype(int), framed
 
     def carve(self, views: list[View], masks: list[np.ndarray]) -> np.ndarray:
-        """(n,) the voxels that all but few of the views that frame them call the object."""
+        """(n,) the voxels that all but few of the views that frame them call the object.
+
+        Views that lost the object, whose cuts are far smaller than most, have no say.
+        """
         seen, against = np.zeros(len(self.points), np.int16), np.zeros(len(self.points), np.int16)
         which = np.flatnonzero(self.allowed)
+        areas = np.array([mask.sum() for mask in masks])
         for view, mask in zip(views, masks, strict=True):
+            if mask.sum() < _TINY * np.median(areas):
+                continue
             row, column, framed = self.pixels(view.camera, which)
             seen[which] += framed
             against[which] += framed & ~mask[row, column]

@@ -69,6 +69,9 @@ def test_ignore_masks_of_another_folder_and_shape(capture, tmp_path):
     (capture / "ignore").rename(capture / "elsewhere")
     with pytest.raises(UserError, match="9 x 9 pixels, but its image is 60 x 44"):
         import_capture(capture, tmp_path / "scene.xml", config=CaptureConfig(ignore=capture / "elsewhere"))
+    (capture / "elsewhere" / "IMG 02.png").write_text("white")
+    with pytest.raises(UserError, match="cannot be read"):
+        import_capture(capture, tmp_path / "scene.xml", config=CaptureConfig(ignore=capture / "elsewhere"))
 
 
 def test_what_lies_beside_the_frame_is_unknown(tmp_path):

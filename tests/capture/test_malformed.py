@@ -178,7 +178,6 @@ CASES = {
     "too few frames of a video": ("nerf", nothing, ["--frames", "1"], "--frames"),
     "ignore folder missing": ("nerf", nothing, ["--ignore", "nowhere"], "correct --ignore"),
     "ignore masks of other names": ("nerf", nothing, ["--ignore", "{source}"], "named like an image"),
-    "known file of another kind": ("colmap", write("ignore/IMG 01.png", b"white"), [], "cannot be read"),
     "LLFF without masks": ("llff", image("images/image001.png", lambda i: i.convert("RGB")), [], "--masks"),
     "mask of another size": ("idr", image("mask/002.png", lambda i: i.resize((9, 9)), "L"), [], "9 x 9"),
     "mask is text": ("idr", write("mask/001.png", b"white"), [], "001.png' cannot be read"),
