@@ -14,7 +14,7 @@ from .compat import write_bitmap
 from .errors import UserError
 from .files import locked, name_trouble, remove_stale, replacing
 from .scene_files import load_scene
-from .targets import Target, depth_file, load_target
+from .targets import Target, depth_file, known_file, load_target
 
 #: Samples per pixel of targets rendered from a scene's reference.
 REFERENCE_SPP = 128
@@ -48,9 +48,9 @@ class FitScene:
 
     @property
     def target_files(self) -> set[Path]:
-        """The files of the targets, depth maps included."""
-        return {file for target in self.targets for file in (target.path, depth_file(target.path))
-                if file is not None}
+        """The files of the targets, and those beside them that say more of them."""
+        return {file for target in self.targets for path in [target.path]
+                for file in (path, depth_file(path), known_file(path)) if file is not None}
 
 
 def load_fit_scene(path: Path, targets: Path | None = None, *,

@@ -23,16 +23,24 @@ class Target:
         rgba: (height, width, 4) float32, linear, premultiplied by alpha.
         has_alpha: False if the file had none and 1 was assumed everywhere.
         depth: (height, width) distances along the rays, world units, 0 where unknown; None without a map.
+        known: (height, width) float32 share of each pixel of which the target tells anything, 1 where it is
+            all; the rest may be the object or not, and of any colour.
     """
 
     path: Path
     rgba: np.ndarray
     has_alpha: bool
     depth: np.ndarray | None = None
+    known: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.known is None:
+            object.__setattr__(self, "known", np.ones(self.rgba.shape[:2], np.float32))
 
 
 def load_target(path: Path, width: int, height: int) -> Target:
-    """Reads one target, with the depth map beside it if there is one, and checks that a fit can use it.
+    """Reads one target, with the depth map and the file of what is known of it beside it if there are such,
+    and checks that a fit can use it.
 
     Raises:
         UserError: the file is missing or unreadable, has another size than its sensor's film, holds
@@ -65,14 +73,40 @@ def load_target(path: Path, width: int, height: int) -> Target:
         raise UserError(f"Target '{path}' has alpha between {alpha.min():.3g} and {alpha.max():.3g}; "
                         f"alpha is coverage and lies between 0 and 1.")
     pixels[..., 3] = np.clip(alpha, 0.0, 1.0)
-    depth = depth_file(path)
-    return Target(path, pixels, has_alpha, load_depth(depth, width, height) if depth else None)
+    depth, known = depth_file(path), known_file(path)
+    return Target(path, pixels, has_alpha, load_depth(depth, width, height) if depth else None,
+                  load_known(known, width, height) if known else None)
 
 
 def depth_file(path: Path) -> Path | None:
     """The depth map beside a target, if there is one."""
     depth = path.with_suffix(".depth.exr")
     return depth if depth.is_file() else None
+
+
+def known_file(path: Path) -> Path | None:
+    """The file of what is known of a target beside it, if there is one."""
+    known = path.with_suffix(".known.exr")
+    return known if known.is_file() else None
+
+
+def load_known(path: Path, width: int, height: int) -> np.ndarray:
+    """Reads what is known of a target: per pixel 1 where it tells whether and what it shows of the object, 0
+    where it tells nothing, such as behind an occluder, where a mask is in doubt or beyond the photograph's
+    frame.
+
+    Returns:
+        (height, width) float32 in [0, 1].
+
+    Raises:
+        UserError: the file is unreadable, has another size than its sensor's film, more than one channel, or
+            values that are no shares.
+    """
+    known = _one_channel(path, "Known map", "1 where the target is known", width, height)
+    if not (np.isfinite(known).all() and known.min() >= 0 and known.max() <= 1):
+        raise UserError(f"Known map '{path}' has values that are no shares; write 1 where the target is "
+                        f"known and 0 where it is not.")
+    return known
 
 
 def load_depth(path: Path, width: int, height: int) -> np.ndarray:
@@ -86,25 +120,29 @@ def load_depth(path: Path, width: int, height: int) -> np.ndarray:
         UserError: the file is unreadable, has another size than its sensor's film, more than one channel,
             negative distances or none at all.
     """
-    try:
-        distance = read_float_image(path)[0]
-    except Exception as error:
-        raise UserError(f"Depth map '{path}' cannot be read as an image ({_first_line(error)}); "
-                        f"write it again as an OpenEXR file.") from error
-    if distance.shape[2] > 1 and (distance != distance[..., :1]).any():
-        raise UserError(f"Depth map '{path}' has {distance.shape[2]} different channels; write one, the "
-                        f"distance along the ray.")
-    distance = np.where(np.isfinite(distance[..., 0]), distance[..., 0], 0.0)
-    if distance.shape != (height, width):
-        found_height, found_width = distance.shape
-        raise UserError(f"Depth map '{path}' is {found_width} x {found_height} pixels, but its sensor's film "
-                        f"is {width} x {height}; resize one of them.")
+    distance = _one_channel(path, "Depth map", "the distance along the ray", width, height)
+    distance = np.where(np.isfinite(distance), distance, 0.0)
     if distance.min() < 0:
         raise UserError(f"Depth map '{path}' has negative distances; write how far the surface is from the "
                         f"camera, along the ray.")
     if not distance.any():
         raise UserError(f"Depth map '{path}' holds no distance at all; delete it, or write some.")
     return distance
+
+
+def _one_channel(path: Path, name: str, meaning: str, width: int, height: int) -> np.ndarray:
+    """(height, width) of an image that has one channel, or the same in all."""
+    try:
+        values = read_float_image(path)[0]
+    except Exception as error:
+        raise UserError(f"{name} '{path}' cannot be read as an image ({_first_line(error)}); write it again "
+                        f"as an OpenEXR file.") from error
+    if values.shape[2] > 1 and (values != values[..., :1]).any():
+        raise UserError(f"{name} '{path}' has {values.shape[2]} different channels; write one, {meaning}.")
+    if values.shape[:2] != (height, width):
+        raise UserError(f"{name} '{path}' is {values.shape[1]} x {values.shape[0]} pixels, but its sensor's "
+                        f"film is {width} x {height}; resize one of them.")
+    return values[..., 0]
 
 
 def _first_line(error: Exception) -> str:

@@ -21,12 +21,14 @@ class Frame:
         camera: with the size of the image file.
         mask: the file of its coverage, if the format names one.
         held_out: kept for measuring; the fit does not see it.
+        ignored: the file of its ignore mask, white where nothing is known, if there is one.
     """
 
     image: Path
     camera: Camera
     mask: Path | None = None
     held_out: bool = False
+    ignored: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,13 @@ import numpy as np
 from PIL import ImageColor
 
 from ..errors import UserError
-from .decoding import SUFFIXES, exif_orientation, images_in, read_pixels
+from .decoding import SUFFIXES, images_in, read_pixels
 from .file_names import Copies, existing
 from .frames import Capture, Frame
+from .reduced import match_frame, read_reduced_grey
 
 #: Folders that data sets keep masks in, beside the images' folder or in the capture's.
 _FOLDERS = ("masks", "mask")
-
-#: From an image as EXIF orientation shows it to as it is stored, where that exchanges width and height:
-#: photographs are read as stored, as calibrations see them, but tools that make masks may turn them.
-_TURNED_BACK = {5: lambda mask: mask.swapaxes(0, 1), 6: lambda mask: np.rot90(mask),
-                7: lambda mask: np.rot90(mask, 2).swapaxes(0, 1), 8: lambda mask: np.rot90(mask, -1)}
 
 _SUPPLY = ("supply images with alpha, a folder of masks (white on the object) as 'masks' beside the images "
            "or with --masks, or the colour behind the object with --background")
@@ -93,7 +89,7 @@ def assign_masks(capture: Capture, folder: Path | None) -> Capture:
     elif not folder.is_dir():
         raise UserError(f"Mask folder '{folder}' does not exist; correct --masks.")
     copies = Copies(frame.image.as_posix() for frame in capture.frames)
-    found = [copies.find(folder, frame.image.as_posix(), _mask_of) for frame in capture.frames]
+    found = [copies.find(folder, frame.image.as_posix(), mask_of) for frame in capture.frames]
     if not any(found):
         inside = images_in(folder)
         if len(inside) != len(capture.frames):
@@ -118,7 +114,7 @@ def _beside(capture: Capture) -> Path | None:
     return None
 
 
-def _mask_of(image: Path) -> Path | None:
+def mask_of(image: Path) -> Path | None:
     """The mask in the place of an image."""
     names = (image.name, image.name + ".png", *(image.stem + suffix for suffix in SUFFIXES))
     exact = next((image.with_name(name) for name in names if image.with_name(name).is_file()), None)
@@ -126,31 +122,33 @@ def _mask_of(image: Path) -> Path | None:
 
 
 def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None = None, *,
-                inverted: bool = False) -> np.ndarray:
+                inverted: bool = False, reduction: int = 1) -> np.ndarray:
     """(h, w) coverage in [0, 1] of a frame with the given stored pixels.
 
     A given background colour comes first, then the frame's mask, then alpha.
 
     Args:
         inverted: mask files are black on the object.
+        reduction: of the pixels, see ``read_reduced``.
 
     Raises:
-        UserError: there is none of them, or the mask has another size than the image.
+        UserError: there is none of them, or the mask has another aspect than the image.
     """
     if background is not None:
         return background.coverage(_unit(pixels[..., :3])).astype(np.float32)
+    size = (frame.camera.width, frame.camera.height)
     if frame.mask is not None:
+        grey = read_reduced_grey(frame.mask, size, reduction)
+        if grey is not None:
+            return 1 - grey if inverted else grey
         mask = read_pixels(frame.mask)
-        orientation = exif_orientation(frame.image)
-        if orientation in _TURNED_BACK and mask.shape[:2] == pixels.shape[1::-1] != pixels.shape[:2]:
-            mask = _TURNED_BACK[orientation](mask)
-        if mask.shape[:2] != pixels.shape[:2]:
-            raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "
-                            f"is {pixels.shape[1]} x {pixels.shape[0]}; resize it.")
         # Some tools put the mask into alpha and leave the colour empty or as it was.
         in_alpha = mask.shape[2] == 4 and _unit(mask[..., 3]).min() < 1
         values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
-        coverage = np.clip(_unit(values, mask.dtype), 0, 1)
+        coverage = match_frame(np.clip(_unit(values, mask.dtype), 0, 1), frame, pixels.shape[:2], reduction)
+        if coverage is None:
+            raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "
+                            f"is {size[0]} x {size[1]}; resize it.")
         return 1 - coverage if inverted else coverage
     if pixels.shape[2] < 4:
         raise UserError(f"Image '{frame.image}' has no alpha, and there is no mask for it; {_SUPPLY}.")

@@ -26,10 +26,17 @@ class Silhouette:
     Attributes:
         camera: for the mask's size; no distortion.
         alpha: (height, width) coverage.
+        known: (height, width) share of each pixel of which coverage is known; None is everything.
     """
 
     camera: Camera
     alpha: np.ndarray
+    known: np.ndarray | None = None
+
+    @property
+    def possible(self) -> np.ndarray:
+        """(height, width) the largest coverage that what is known allows."""
+        return self.alpha if self.known is None else np.maximum(self.alpha, 1 - self.known)
 
     @property
     def is_empty(self) -> bool:
@@ -71,16 +78,17 @@ class Carving:
     """The volume that all masks share, tested at points.
 
     A point is kept if no view excludes it by more than ``slack``, so that a coarse grid misses nothing
-    thin. A view excludes what falls beside its mask, and what it does not frame if its mask keeps
-    clear of the border, for then it shows the whole object. Daylight that a mask encloses excludes nothing,
-    as in ``fields.visual_hull``.
+    thin. A view excludes what falls beside its mask and what is unknown there, and what it does not frame if
+    its mask keeps clear of the border, for then it shows the whole object. Daylight that a mask encloses
+    excludes nothing, as in ``fields.visual_hull``.
     """
 
     def __init__(self, silhouettes: list[Silhouette]):
         self._views = []
         for silhouette in silhouettes:
-            inside = ndimage.binary_fill_holes(silhouette.alpha >= 0.5)
-            whole = not (inside[[0, -1]].any() or inside[:, [0, -1]].any())
+            inside = ndimage.binary_fill_holes(silhouette.possible >= 0.5)
+            mask = silhouette.alpha >= 0.5
+            whole = not (mask[[0, -1]].any() or mask[:, [0, -1]].any())
             self._views.append((silhouette.camera, ndimage.distance_transform_edt(~inside), whole))
 
     def keeps(self, points: np.ndarray, slack: float) -> np.ndarray:

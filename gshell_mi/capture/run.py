@@ -18,17 +18,21 @@ from ..float_images import is_exr
 from ..interrupt import check_interrupt
 from ..scene_inputs import scene_inputs
 from ..wording import counted
+from .acquire import acquire, lacks_masks, make_masks
 from .camera import Camera
 from .config import AXES, CaptureConfig
-from .decoding import ColorDecoding, color_profile, exif_orientation
-from .formats import mitsuba, read_capture
+from .decoding import FLOAT_SUFFIXES, ColorDecoding, color_profile, exif_orientation
+from .evidence import assign_ignored
+from .formats import mitsuba
 from .frames import Capture, Frame
 from .masks import Background, assign_masks
+from .parallel import in_order
 from .prepare import Preparation, exposure_gains
 from .region import FLIPPED_AXES, find_box, likely_misreading
 from .staging import staged
 from .trouble import Thumbnail, find_trouble
-from .writer import clipping_depths, scene_xml, sensors_xml, write_record, write_target
+from .workspace import Progress
+from .writer import clipping_depths, scene_xml, sensors_xml, write_known, write_record, write_target
 
 #: An object farther from the origin than so many of its sizes is moved there.
 _FAR = 50.0
@@ -45,6 +49,7 @@ class CaptureResult:
         training, held_out: numbers of views.
         box: (2, 3) corners of the lattice's cube, in the scene.
         warnings: what is likely wrong, a sentence each.
+        made: what was made because it was not there: "cameras", "masks".
     """
 
     path: Path
@@ -52,24 +57,30 @@ class CaptureResult:
     held_out: int
     box: np.ndarray
     warnings: tuple[str, ...]
+    made: tuple[str, ...] = ()
 
 
 def import_capture(source: str | Path, output: str | Path, *, config: CaptureConfig | None = None,
                    overwrite: bool = False,
-                   progress: Callable[[int, int], None] | None = None) -> CaptureResult:
-    """Turns photographs with known cameras into a fit scene.
+                   progress: Callable[[int, int], None] | None = None,
+                   steps: Progress | None = None) -> CaptureResult:
+    """Turns photographs into a fit scene; cameras and masks that they lack are made.
 
     A Mitsuba ``llvm`` or ``cuda`` variant must be set. Writes ``output`` (an XML file) and beside it the
     folder of its stem: targets ``view_000.exr`` and so on, ``sensors.xml``, ``capture.json`` (which view is
     which photograph, how the world was moved) and, if there are held-out views, ``test.xml`` with
-    ``test/test_000.exr`` and so on. Either all of that or, on an error, nothing.
+    ``test/test_000.exr`` and so on. Either all of that or, on an error, nothing. Cameras, masks and the
+    frames of a video are kept in a folder beside it, whose name ends in ``.work``, from where a second call
+    takes them.
 
     Args:
-        source: the capture's folder or main file.
+        source: the capture's folder or main file, a folder of photographs, or a video.
         output: the fit scene to write.
         config: see ``CaptureConfig``.
         overwrite: replace what an earlier import wrote.
         progress: called with (photographs done, photographs).
+        steps: called with (what, done, in all) in the steps before, which only captures without cameras or
+            masks have.
 
     Raises:
         UserError: of anything in the capture or the options that the user can mend.
@@ -77,23 +88,31 @@ def import_capture(source: str | Path, output: str | Path, *, config: CaptureCon
     config = config or CaptureConfig()
     source, output = Path(source), Path(output)
     with staged(output, overwrite=overwrite, source=source) as staging:
-        work = _Import(source, output, config, progress)
+        work = _Import(source, output, config, progress, steps)
         staging.check_inputs(work.inputs())
         return work.write(staging.path)
 
 
 class _Import:
     def __init__(self, source: Path, output: Path, config: CaptureConfig,
-                 progress: Callable[[int, int], None] | None):
+                 progress: Callable[[int, int], None] | None, steps: Progress | None):
         self.config, self.output, self.progress = config, output, progress
         decoding = ColorDecoding(config.color_space, config.transfer)
         background = None
-        if config.background is not None:
+        if config.background is not None and not Path(config.background).is_file():
             background = Background.parse(config.background, config.background_tolerance)
-        capture = read_capture(source, format=config.format, images=config.images,
-                               opencv_axes=config.opencv_axes)
+
+        def told(what: str, done: int, count: int) -> None:
+            check_interrupt()
+            if steps:
+                steps(what, done, count)
+
+        acquired = acquire(source, output, config, told)
         if background is None:
-            capture = assign_masks(capture, config.masks)
+            acquired.capture = assign_masks(acquired.capture, config.masks)
+            if config.make_masks != "off" and lacks_masks(acquired.capture):
+                make_masks(acquired, config, lambda capture: to_scene(capture, config.up), told)
+        capture, self.made = assign_ignored(acquired.capture, config.ignore), tuple(acquired.made)
         if config.hold_out:
             capture = capture.holding_out(config.hold_out)
         if not capture.training:
@@ -103,7 +122,9 @@ class _Import:
             replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames))
         gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
         self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains)
-        self.warnings = [*capture.notes, *_profile_warning(capture, config), *_turned_warning(capture)]
+        self.warnings = [*capture.notes, *_profile_warning(capture, config)]
+        if "masks" not in self.made:
+            self.warnings += _turned_warning(capture)
         self.cameras: dict[str, Camera] = {}
         self.tests: dict[str, Camera] = {}
         self.thumbnails: list[Thumbnail] = []
@@ -111,9 +132,9 @@ class _Import:
 
     def inputs(self) -> set[Path]:
         """The files that are read and could be mistaken for some that are written."""
-        files = {file for frame in self.capture.frames for file in (frame.image, frame.mask) if file}
-        if self.config.light is not None:
-            files.add(Path(self.config.light))
+        files = {file for frame in self.capture.frames for file in (frame.image, frame.mask, frame.ignored)
+                 if file}
+        files |= {Path(file) for file in (self.config.light, self.config.background) if file is not None}
         if self.capture.format == mitsuba.NAME:
             files |= scene_inputs(mitsuba.find(self.capture.source))
         return files
@@ -133,13 +154,16 @@ class _Import:
         # Names that the locale cannot spell come as escaped bytes, and go back as these.
         (partial / self.output.name).write_text(document, encoding="utf-8", errors="surrogateescape")
         write_record(folder, self._record(box))
-        return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings))
+        return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings),
+                             self.made)
 
     def _write_targets(self, folder: Path) -> None:
-        empty, faint, most = [], {}, 0.0
-        for index, frame in enumerate(self.capture.frames):
+        empty, faint, most, frames = [], {}, 0.0, self.capture.frames
+        # Mitsuba's reader of floating point files has threads of its own.
+        threads = 1 if any(frame.image.suffix.lower() in FLOAT_SUFFIXES for frame in frames) else None
+        targets = in_order(self.preparation.target, frames, threads=threads)
+        for index, (frame, target) in enumerate(zip(frames, targets, strict=True)):
             check_interrupt()
-            target = self.preparation.target(frame)
             most = max(most, target.covered)
             if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
                 empty.append(frame.image.name)    # it would carve away everything that it frames
@@ -147,15 +171,17 @@ class _Import:
             if target.covered < _FAINT_MASK:
                 faint[frame.image.name] = target.covered
             name = f"test_{len(self.tests):03}" if frame.held_out else f"view_{len(self.cameras):03}"
+            place = folder / "test" if frame.held_out else folder
+            place.mkdir(exist_ok=True)
+            write_target(place / f"{name}.exr", target.rgba)
+            if target.known is not None:
+                write_known(place / f"{name}.exr", target.known)
             if frame.held_out:
-                (folder / "test").mkdir(exist_ok=True)
-                write_target(folder / "test" / f"{name}.exr", target.rgba)
                 self.tests[name] = target.camera
             else:
-                write_target(folder / f"{name}.exr", target.rgba)
                 self.cameras[name] = target.camera
-                label = f"{name} ({frame.image.name})"
-                self.thumbnails.append(Thumbnail.of(label, target.rgba, target.camera, target.clipped))
+                self.thumbnails.append(Thumbnail.of(f"{name} ({frame.image.name})", target.rgba,
+                                                    target.camera, target.clipped, target.known))
             self.views.append(self._view_record(name, frame, target.clipped))
             if self.progress:
                 self.progress(index + 1, len(self.capture.frames))

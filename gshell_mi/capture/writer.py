@@ -106,6 +106,16 @@ def write_target(path: Path, rgba: np.ndarray) -> None:
     write_bitmap(bitmap.convert(component_format=mi.Struct.Type.Float16), path)
 
 
+def write_known(path: Path, known: np.ndarray) -> None:
+    """Writes beside the target ``path`` what of it is known, (height, width) in [0, 1]; see ``targets``.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    bitmap = mi.Bitmap(np.ascontiguousarray(known[..., None], dtype=np.float32), mi.Bitmap.PixelFormat.Y)
+    write_bitmap(bitmap.convert(component_format=mi.Struct.Type.Float16), path.with_suffix(".known.exr"))
+
+
 def write_record(folder: Path, record: dict) -> None:
     text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
     (folder / RECORD).write_text(text, encoding="utf-8", errors="surrogateescape")
