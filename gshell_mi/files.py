@@ -51,7 +51,10 @@ def replacing(path: Path) -> Iterator[Path]:
         _swept.add(path.parent.absolute())
         remove_stale(path.parent)
     partial = path.with_name(f"{PARTIAL}{secrets.token_hex(6)}{path.suffix[:32]}")
-    handle = os.open(partial, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+    try:
+        handle = os.open(partial, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+    except OSError as error:  # of a name that nobody knows
+        raise OSError(error.errno, error.strerror, str(path)) from error
     try:
         _try_lock(handle)
         yield partial

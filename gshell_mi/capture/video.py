@@ -17,6 +17,9 @@ from .workspace import Progress, Workspace, fingerprint
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 
+#: ffmpeg's names of what such files may be; playlists, which lead to other files, are none of them.
+_CONTAINERS = "mov,mp4,avi,matroska,webm"
+
 #: Longer side, in pixels, of the copies that are judged.
 _JUDGED = 320
 
@@ -81,7 +84,10 @@ def _frames(video: Path, pixels: str, options: list[str]) -> Iterator:
     # It warns of frames that are asked for in another size.
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     try:
-        yield from imageio_ffmpeg.read_frames(str(video), pix_fmt=pixels, output_params=options,
+        # As it is, ffmpeg would take a name for an address or a list.
+        yield from imageio_ffmpeg.read_frames(f"file:{video.absolute()}", pix_fmt=pixels,
+                                              input_params=["-format_whitelist", _CONTAINERS],
+                                              output_params=options,
                                               bits_per_pixel=8 if pixels == "gray" else 24)
     except (OSError, RuntimeError, KeyError, IndexError) as error:
         reason = ([line for line in str(error).splitlines() if line.strip()] or [repr(error)])[-1].strip()

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..errors import UserError
 from ..files import replacing
+from ..own_folder import TAG, is_own_file
 
 #: Called with (what is being done, steps done, steps in all).
 Progress = Callable[[str, int, int], None]
@@ -29,7 +30,7 @@ class Workspace:
 
     def __init__(self, path: Path):
         self.path = path
-        if path.exists() and not (path / _MARK).is_file() and (not path.is_dir() or any(path.iterdir())):
+        if path.exists() and not is_own_file(path / _MARK) and (not path.is_dir() or any(path.iterdir())):
             raise UserError(f"'{path}', where the steps before a scene are kept, was not made by "
                             f"gshell_mi.capture; move it away or choose another output.")
 
@@ -49,7 +50,8 @@ class Workspace:
                 return folder
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
-            (self.path / _MARK).write_text('{"made by": "gshell_mi.capture; safe to delete"}\n')
+            with replacing(self.path / _MARK) as partial:
+                partial.write_text(f'{{"note": "{TAG}.capture; safe to delete"}}\n', encoding="utf-8")
             with replacing(folder / "job.json") as partial:
                 partial.write_text(text, encoding="utf-8")
         except OSError as error:

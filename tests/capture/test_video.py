@@ -1,5 +1,7 @@
 """Videos to frames."""
 
+from pathlib import Path
+
 import imageio_ffmpeg
 import numpy as np
 import pytest
@@ -56,6 +58,20 @@ def test_a_video_is_cut_once(clip, tmp_path, monkeypatch):
     assert np.abs(difference).mean() < 6
     monkeypatch.setattr(video, "_judge", None)
     assert video.cut(path, Workspace(tmp_path / "s.work"), 4) == files
+
+
+@pytest.mark.parametrize("name", ["-dash.mp4", "concat:a|b.mp4", "pipe:0.mp4", "%d.mp4"])
+def test_any_name_is_a_files(clip, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_bytes(clip[0].read_bytes())
+    assert len(video.cut(Path(name), Workspace(Path("s.work")), 4)) == 4
+
+
+def test_a_playlist_is_no_video(clip, tmp_path):
+    (tmp_path / "clip.mp4").write_bytes(clip[0].read_bytes())
+    (tmp_path / "v.mp4").write_text("ffconcat version 1.0\nfile 'clip.mp4'\n")
+    with pytest.raises(UserError, match=r"v\.mp4' cannot be read"):
+        video.cut(tmp_path / "v.mp4", Workspace(tmp_path / "s.work"), 4)
 
 
 def test_what_is_no_video_is_told(clip, tmp_path):

@@ -20,12 +20,13 @@ def test_a_changed_file_is_another_job(tmp_path):
     assert fingerprint([tmp_path / "a.jpg"]) != before
 
 
-def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
+@pytest.mark.parametrize("name", ["thesis.tex", "steps.json"])
+def test_a_folder_of_somebody_else_is_left_alone(tmp_path, name):
     (tmp_path / "scene.work").mkdir()
-    (tmp_path / "scene.work" / "thesis.tex").write_text("precious")
+    (tmp_path / "scene.work" / name).write_text("precious")
     with pytest.raises(UserError, match="was not made by gshell_mi"):
         Workspace(tmp_path / "scene.work")
-    assert (tmp_path / "scene.work" / "thesis.tex").read_text() == "precious"
+    assert (tmp_path / "scene.work" / name).read_text() == "precious"
 
 
 def test_a_place_that_cannot_be_written(tmp_path):

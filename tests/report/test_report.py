@@ -6,7 +6,6 @@ import re
 import shutil
 import threading
 from dataclasses import asdict
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from gshell_mi.fit.config import FitConfig
 from gshell_mi.own_folder import OwnFolder
 from gshell_mi.report import ReportConfig, write_report
 from gshell_mi.report.__main__ import main
-from gshell_mi.report.curves import curves
 from gshell_mi.report.metrics import read_metrics
 from gshell_mi.report.viewer_model import boundary_tubes, viewer_model
 from gshell_mi.topology import topology
@@ -61,54 +59,6 @@ def test_page_is_self_contained(folder):
     assert "<td>diagnostics.floaters</td><td>1</td>" in page and "<td>peak_memory_mib</td>" in page
     assert "31.25 dB" in page and "view_000: target | fit, 31.50 dB" in page and "view_002" in page
     assert "ghost_iterations" in text and "seconds.hull" in text
-
-
-def test_curves(tmp_path):
-    log = tmp_path / "log.jsonl"
-    assert curves(log) == []
-    steps = [{"stage": "joint", "iteration": i, "loss": 10.0 ** -i, "psnr": i} for i in range(3)]
-    log.write_text("".join(json.dumps(step) + "\n" for step in steps))
-    losses, psnr = curves(log)
-    points = np.array([p.split(",") for p in re.search(r'points="([^"]*)"', losses)[1].split()], float)
-    assert np.ptp(np.diff(points, axis=0), axis=0) == pytest.approx(0, abs=0.2), "straight when logarithmic"
-    assert points[0, 1] < points[-1, 1] and "PSNR" in psnr
-    many = {f"loss_number_{i}": 1.0 + i for i in range(12)}
-    log.write_text(json.dumps({"stage": "joint", "iteration": 0, **many}) + "\n")
-    rows = [re.findall(r">([^<]+)</tspan>", row) for row in re.findall(r"<text[^>]*>(<tspan.*?)</text>",
-                                                                       curves(log)[0])]
-    told = [name for row in rows for name in row]
-    assert told == [name.replace("_", " ") for name in many], "a legend of rows that fit"
-    assert all(sum(map(len, row)) <= 70 for row in rows)
-    log.write_text(json.dumps({"stage": "joint", "iteration": 0, "loss": float("nan")}) + "\n")
-    assert "polyline" not in "".join(curves(log))
-
-
-HOSTILE = ["garbage", "", "5", "[]", '"joint"', "[" * 9000, "\0\0",
-           '{"stage": 5, "iteration": 0, "loss": 1}', '{"stage": "joint"}',
-           '{"stage": "joint", "iteration": "x", "loss": 1}', '{"stage": "joint", "iter',
-           '{"stage": "joint", "iteration": 1e999, "loss": 1}', "\udcff",
-           '{"stage": "joint", "iteration": 0, "loss": "<b>", "a": [1], "b": {}, "c": null, "d": true}',
-           '{"stage": "joint", "iteration": 0, "loss": 1' + "0" * 400 + "}"]
-
-
-@pytest.mark.parametrize("line", HOSTILE)
-def test_lines_that_are_no_steps(tmp_path, line):
-    log = tmp_path / "log.jsonl"
-    step = json.dumps({"stage": "joint", "iteration": 3, "loss": 0.5})
-    log.write_text(f"{line}\n{step}\n", errors="surrogateescape")
-    (drawing,) = curves(log)
-    assert "joint: losses" in drawing and drawing.count("<polyline") == 1
-
-
-def test_names_in_the_log_are_escaped(folder, tmp_path):
-    for stage, loss in (("<script>alert(1)</script>", "loss"), ("joint", "<img src=x onerror=alert(1)>"),
-                        ('"><script>', '</title><script>')):
-        log = tmp_path / "log.jsonl"
-        steps = [{"stage": stage, "iteration": i, loss: 0.5, "other": 0.25} for i in range(3)]
-        log.write_text("".join(json.dumps(step) + "\n" for step in steps))
-        for drawing in curves(log):
-            names = {element.tag for element in ElementTree.fromstring(drawing).iter()}
-            assert names == {"svg", "text", "path", "polyline", "title", "tspan"}
 
 
 METRICS = {"scene": "a.xml", "psnr_training": 30.0, "psnr_per_view": {"view_000": 30.0}, "versions": {},
