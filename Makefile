@@ -1,6 +1,7 @@
 # make fit    set everything up and reconstruct SCENE (default scenes/tshirt.xml) into OUT
 # make test   set everything up, check the style and run the tests
 # make scenes rebuild the scenes from code
+# make fuzz   try damaged inputs of every kind, for ten minutes
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -16,10 +17,10 @@ PY := $(VENV)/bin/python
 export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help fit test scenes clean
+.PHONY: help fit test scenes fuzz clean
 
 help:
-	@sed -n 's/^# //p' Makefile | head -3
+	@sed -n 's/^# //p' Makefile | head -4
 
 fit: $(VENV)/.llvm
 	@$(PY) -m gshell_mi.fit $(SCENE) -o $(OUT) --overwrite $(ARGS)
@@ -30,6 +31,9 @@ test: $(VENV)/.test $(VENV)/.llvm
 
 scenes: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) pipelines/make_scenes.py $(ARGS)
+
+fuzz: $(VENV)/.test $(VENV)/.llvm
+	@$(PY) pipelines/fuzz.py $(ARGS)
 
 clean:
 	rm -rf $(VENV) build *.egg-info

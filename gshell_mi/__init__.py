@@ -14,8 +14,10 @@ The rooms, in the order in which data flows through them:
 - ``viewer``: a look at it while it runs, ``--viewer``
 - ``images``, ``topology``, ``export``, ``turntable``, ``report``: what it leaves behind
 - ``evaluation``, ``compare``: how good it is
-- ``command_line``, ``doctor``, ``errors``, ``files``, ``memory``: what the commands share; whether this
-  machine can run it all
+- ``scene_files``, ``scene_inputs``, ``float_images``, ``environment_maps``, ``mesh_files``, ``json_files``:
+  files that anybody may have written, read with care
+- ``command_line``, ``streams``, ``interrupt``, ``errors``, ``files``, ``own_folder``, ``memory``: what the
+  commands share; ``doctor``: whether this machine can run it all
 - ``compat``, ``plugins``: what depends on Mitsuba's version, and how its plugins are registered
 
 Importing the package sets no variant; its plugins register for the variant in use and for every later one.
@@ -27,6 +29,11 @@ Importing the package sets no variant; its plugins register for the variant in u
 >>> float(dr.max(bowl.vertices.z)[0]) < 0.2 + 1e-5     # cut open at z = 0.2
 True
 """
+
+# ruff: noqa: E402
+from .streams import begin_command
+
+begin_command()  # before what takes long to import
 
 from .errors import UserError
 from .extraction import SurfaceMesh, extract

@@ -9,7 +9,8 @@ from typing import TypeVar
 import tyro
 
 from .doctor import ensure_variant
-from .errors import UserError
+from .interrupt import Interrupt
+from .streams import with_streams
 
 Arguments = TypeVar("Arguments")
 
@@ -32,17 +33,24 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
     Returns:
         The exit code: 0, 2 after a user's mistake (told on stderr in one sentence), 130 after Ctrl-C.
     """
-    try:
+    def run() -> int:
         parsed = tyro.cli(arguments, args=given, prog=f"python -m gshell_mi.{name}", description=description,
                           config=(tyro.conf.FlagCreatePairsOff,),
                           **({} if default is None else {"default": default}))
-        try:
-            ensure_variant(parsed.variant)
-            work(parsed)
-        except KeyboardInterrupt:
-            print(interrupted(parsed), file=sys.stderr)
-            return 130
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+        with Interrupt() as interrupt:
+            try:
+                ensure_variant(parsed.variant)
+                interrupt.check()
+                work(parsed)
+            except KeyboardInterrupt:
+                pass
+            except Exception:
+                # Raised while C++ was calling Python, Ctrl-C comes out of it as an error of any kind.
+                if not interrupt.pending:
+                    raise
+            else:
+                return 0
+        print(interrupted(parsed), file=sys.stderr)
+        return 130
+
+    return with_streams(run)

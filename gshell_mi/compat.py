@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import errno
+import os
+import sys
+import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,6 +19,47 @@ import numpy as np
 
 #: Major and minor version of Dr.Jit.
 DRJIT_VERSION = tuple(int(part) for part in dr.__version__.split(".")[:2])
+
+#: Integrators that Mitsuba registers from Python; all its other plugins are libraries in its folder.
+MITSUBA_INTEGRATORS = ("prb", "prb_basic", "prb_projective", "prbvolpath", "direct_projective",
+                       "volprim_rf_basic")
+
+
+def mitsuba_folder() -> Path:
+    """Where Mitsuba is installed, with its own plugins in ``plugins``."""
+    return Path(mi.__file__).resolve().parent
+
+
+def trust_only_own_plugins() -> None:
+    """Puts Mitsuba's folder in front of its resource path, where it looks for plugins by name.
+
+    Otherwise ``plugins/path.so`` in the folder of a scene, or in the current one, would be taken for
+    Mitsuba's integrator, and run.
+    """
+    resolver, own = mi.file_resolver(), mitsuba_folder()
+    if Path(str(resolver[0])).resolve() != own:
+        resolver.prepend(str(own))
+
+
+_silence = threading.RLock()
+
+
+@contextmanager
+def without_chatter() -> Iterator[None]:
+    """Drops what native libraries print meanwhile: OpenEXR writes of a damaged file, and raises too."""
+    with _silence, ExitStack() as stack:
+        for stream, number in ((sys.stdout, 1), (sys.stderr, 2)):
+            try:
+                stream.flush()
+                kept = os.dup(number)
+            except (OSError, ValueError, AttributeError):    # closed: there is nobody to disturb
+                continue
+            stack.callback(os.close, kept)
+            stack.callback(os.dup2, kept, number)
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, number)
+            os.close(nowhere)
+        yield
 
 
 def environment_data(radiance: mi.TensorXf) -> mi.TensorXf:

@@ -22,6 +22,7 @@ import mitsuba as mi
 from . import __version__, compat
 from .errors import UserError
 from .memory import GIB, free_memory
+from .streams import with_streams
 
 _NAN_MINIMUM = platform.machine().lower() in ("x86_64", "amd64") and compat.DRJIT_VERSION >= (1, 5)
 
@@ -209,6 +210,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--llvm", action="store_true", help="check LLVM only, without a render or report")
     parser.add_argument("--render", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
+    return with_streams(lambda: _run(args))
+
+
+def _run(args: argparse.Namespace) -> int:
     if args.render:
         print(json.dumps(_render()))
         return 0

@@ -10,6 +10,8 @@ import sys
 
 import mitsuba as mi
 
+from .compat import trust_only_own_plugins
+
 #: Modules that define a plugin class at import and register it with Mitsuba.
 PLUGIN_MODULES = (
     "gshell_mi.shape",
@@ -40,5 +42,6 @@ def register() -> None:
 
 def register_on_variant_change() -> None:
     """Registers now if a variant is set, and again whenever it changes."""
+    trust_only_own_plugins()
     mi.detail.add_variant_callback(lambda old, new: register())
     register()

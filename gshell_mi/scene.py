@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 
 from .compat import write_bitmap
 from .errors import UserError
-from .files import replacing
-from .targets import Target, load_target
+from .files import locked, name_trouble, remove_stale, replacing
+from .scene_files import load_scene
+from .targets import Target, depth_file, known_file, load_target
 
 #: Samples per pixel of targets rendered from a scene's reference.
 REFERENCE_SPP = 128
@@ -44,6 +46,12 @@ class FitScene:
     def name(self) -> str:
         return self.path.stem
 
+    @property
+    def target_files(self) -> set[Path]:
+        """The files of the targets, and those beside them that say more of them."""
+        return {file for target in self.targets for path in [target.path]
+                for file in (path, depth_file(path), known_file(path)) if file is not None}
+
 
 def load_fit_scene(path: Path, targets: Path | None = None, *,
                    before_targets: Callable[[mi.Shape, list[mi.Sensor]], None] | None = None,
@@ -59,12 +67,13 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
 
     Raises:
         UserError: the file is missing or not a Mitsuba scene, it has not exactly one gshell shape, no
-            emitter ``light``, no sensors, sensors of the same id, or a target is missing or unusable.
+            emitter ``light``, no sensors, sensors of the same id or of one that cannot be a file's name, or a
+            target is missing or unusable.
     """
     path = Path(path)
     if not path.is_file():
         raise UserError(f"Scene '{path}' does not exist; give the path of a fit scene's XML file.")
-    scene = _load(path)
+    scene = load_scene(path)
     subject = _the_subject(scene, path)
     light = _the_light(scene, path)
     sensors = scene.sensors()
@@ -74,6 +83,10 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
     if repeated:
         raise UserError(f"Scene '{path}' has several sensors with the id '{repeated[0]}'; "
                         f"rename all but one.")
+    for name in (sensor.id() for sensor in sensors):
+        if trouble := name_trouble(name):
+            raise UserError(f"The id {name[:80]!r} of a sensor of scene '{path}' {trouble}; targets and "
+                            f"results are files of these names: give it one such as \"view_000\".")
     if before_targets:
         before_targets(subject, sensors)
     folder = Path(targets) if targets else path.with_suffix("")
@@ -84,23 +97,6 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
         raise UserError(f"The targets in '{folder}' show no object: their alpha is 0 everywhere; "
                         f"write coverage into it.")
     return FitScene(path, scene, subject, subject.bsdf(), light, sensors, loaded)
-
-
-def _load(path: Path) -> mi.Scene:
-    try:
-        return mi.load_file(str(path))
-    except UserError:
-        raise
-    except Exception as error:
-        raise UserError(f"Scene '{path}' cannot be loaded by Mitsuba: {_reason(error)}") from error
-
-
-def _reason(error: Exception) -> str:
-    """The one line of Mitsuba's message that says what is wrong."""
-    lines = str(error).strip().splitlines() or [repr(error)]
-    # A plugin's own complaint comes below the traceback that Mitsuba puts into its message.
-    _, found, complaint = lines[-1].partition(f"{UserError.__name__}: ")
-    return complaint if found else lines[0]
 
 
 def _the_subject(scene: mi.Scene, path: Path) -> mi.Shape:
@@ -120,6 +116,11 @@ def _the_light(scene: mi.Scene, path: Path) -> mi.Emitter:
     if not known or not found[0].is_environment():
         raise UserError(f"Scene '{path}' has no environment emitter with the id 'light'; add "
                         f"<emitter type=\"constant\" id=\"light\"/> or an envmap as the initial lighting.")
+    parameters = mi.traverse(found[0])
+    for name in ("data", "scale", "radiance.value"):
+        if name in parameters and not np.isfinite(np.array(parameters[name])).all():
+            raise UserError(f"The emitter 'light' of scene '{path}' has a {name} with NaN or infinity; give "
+                            f"it finite values.")
     return found[0]
 
 
@@ -136,10 +137,19 @@ def render_missing_targets(reference: Path, folder: Path, sensors: list[mi.Senso
     Raises:
         UserError: the reference cannot be loaded, or a target not be written.
     """
-    missing = [sensor for sensor in sensors if not (folder / f"{sensor.id()}.exr").exists()]
-    if not missing or not reference.is_file():
+    def absent() -> list[mi.Sensor]:
+        return [sensor for sensor in sensors if not (folder / f"{sensor.id()}.exr").exists()]
+
+    if not reference.is_file() or not absent():
         return
-    scene = _load(reference)
+    with locked(folder, wait=True):  # of two fits of a scene, one renders
+        remove_stale(folder)
+        _render(reference, folder, absent(), progress)
+
+
+def _render(reference: Path, folder: Path, missing: list[mi.Sensor],
+            progress: Callable[[int, int], None] | None) -> None:
+    scene = load_scene(reference)
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
     for index, sensor in enumerate(missing):
         if progress:

@@ -19,6 +19,7 @@ from .timing import phase
 
 _FIELDS = ("sdf", "msdf", "deform", "weights")
 _LATTICE_PREFIX = "lattice_"
+_UNMERGED = "vertex_unmerged"
 
 #: Bytes per lattice vertex that constructing a shape takes, measured with 128 and 256 cells per side.
 _BYTES_PER_VERTEX = 32
@@ -94,8 +95,13 @@ class GShell(mi.Mesh):
         self._attributes: dict[str, tuple[Any, int]] = {}
         self._mirrored = bool(np.linalg.det(np.array(self.to_world.matrix)[:3, :3]) < 0)
         self.set_fields(_initial_fields(self.filename, grid, resolution, self.to_world, band))
+        # Mitsuba merges the meshes of a scene that have equal materials into plain ones, but for those with
+        # attributes. So there is one until somebody looks.
+        self.add_attribute(_UNMERGED, 1, dr.zeros(mi.Float, self.vertex_count()))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
+        if self.has_attribute(_UNMERGED):
+            self.remove_attribute(_UNMERGED)
         differentiable = mi.ParamFlags.Differentiable
         for name in self.field_names:
             callback.put(name, getattr(self, name), differentiable | mi.ParamFlags.Discontinuous)

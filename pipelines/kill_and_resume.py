@@ -29,6 +29,7 @@ from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
+import imageio_ffmpeg
 import mitsuba as mi
 import numpy as np
 import trimesh
@@ -151,6 +152,8 @@ _READERS = {
     ".npz": Checkpoint.load, ".ply": read_ply, ".glb": trimesh.load, ".xml": ElementTree.parse,
     ".json": lambda path: json.loads(path.read_text()), ".jsonl": _read_log, ".html": _read_page,
     ".exr": lambda path: mi.Bitmap(str(path)), ".png": lambda path: Image.open(path).load(),
+    ".gif": lambda path: Image.open(path).load(), ".mp4": imageio_ffmpeg.count_frames_and_secs,
+    ".obj": trimesh.load, ".mtl": lambda path: path.read_text(),
 }
 
 

@@ -46,7 +46,7 @@ def test_it_follows_the_surface_and_forgets_what_is_far(sphere):
     centre = detail.bricks.centres()
     detail.values = dr.ravel(mi.Vector4f(centre.x, centre.y, centre.z, 0))
     vertices, _, _ = sphere.surface.to_numpy()
-    moved = vertices + [0.1, 0, 0]
+    moved = vertices + np.array([0.1, 0, 0])
     source = detail.follow(moved)
     assert dr.width(source) == detail.bricks.voxel_count
     kept = np.abs(detail.values.numpy().reshape(-1, 4)).sum(axis=1) > 0

@@ -2,6 +2,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 from topology import assert_manifold
 
 from gshell_mi import UserError
@@ -396,3 +397,21 @@ def test_fields_in_blocks_from_a_file(tmp_path, grid):
     again = subject.fields()
     for name in ("sdf", "msdf", "deform", "blocks"):
         np.testing.assert_array_equal(getattr(again, name), getattr(given, name))
+
+
+@pytest.mark.parametrize("other", ["ply", "gshell"])
+def test_a_neighbour_of_equal_material_does_not_swallow_it(other, tmp_path):
+    """Mitsuba makes one plain mesh of those that have equal materials."""
+    trimesh.creation.icosphere(1).export(tmp_path / "ball.ply")
+    bsdf = {"type": "diffuse"}
+    neighbour = {"type": other, "bsdf": bsdf} | (
+        {"filename": str(tmp_path / "ball.ply")} if other == "ply" else {"resolution": 8})
+    scene = mi.load_dict({"type": "scene", "other": neighbour,
+                          "subject": {"type": "gshell", "resolution": 16, "bsdf": bsdf}})
+    assert len(scene.shapes()) == 2
+    params = mi.traverse(scene)
+    assert "subject.sdf" in params and not any("unmerged" in key for key in params.keys())
+    params["subject.sdf"] = params["subject.sdf"] - 0.25
+    params.update()
+    radii = np.linalg.norm(_subject(scene).surface.to_trimesh().vertices, axis=1)
+    np.testing.assert_allclose(radii, 0.75, atol=0.01)

@@ -1,4 +1,4 @@
-"""Photographs with known cameras to a fit scene: ``python -m gshell_mi.capture SRC -o SCENE.xml``."""
+"""Photographs or a video to a fit scene: ``python -m gshell_mi.capture SRC -o SCENE.xml``."""
 
 from .camera import Camera, Distortion
 from .config import CaptureConfig

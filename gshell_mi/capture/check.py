@@ -10,14 +10,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
 
 from ..compat import write_mesh
 from ..errors import UserError
 from ..extraction import extract
 from ..fields.visual_hull import visual_hull
+from ..files import replacing
 from ..fit.config import FitConfig
 from ..images import srgb
 from ..lattice import TetLattice
+from ..own_folder import TAG, check_own_file
 from ..scene import FitScene, load_fit_scene
 from ..views import PinholeViews
 from .camera import Camera
@@ -35,6 +38,8 @@ _FONT = 15
 _PAPER, _INK, _TROUBLE = (250, 250, 250), (40, 40, 40), (200, 40, 20)
 _BOX, _HULL = (255, 150, 0), (255, 0, 200)
 _AXES = ((220, 40, 40), (40, 160, 40), (50, 80, 230))
+#: Linear, over what a target does not know.
+_UNKNOWN = (0.05, 0.15, 0.6)
 _FRUSTUM, _FIRST = (90, 110, 140), (200, 40, 20)
 #: Pairs of a cube's corners, as bit patterns, that an edge joins.
 _EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
@@ -65,13 +70,18 @@ def check_scene(scene: str | Path, picture: str | Path | None = None) -> CheckRe
         picture: the PNG to write; default ``check.png`` in the folder of its targets.
 
     Raises:
-        UserError: the scene cannot be loaded, or the picture not be written.
+        UserError: the scene cannot be loaded, or the picture not be written, as where a file is in its place
+            that no check drew.
     """
     fit_scene = load_fit_scene(Path(scene))
     picture = Path(picture) if picture else Path(scene).with_suffix("") / "check.png"
+    check_own_file(picture)
     sheet = _Sheet(fit_scene)
+    tag = PngInfo()
+    tag.add_text("Software", TAG)
     try:
-        sheet.draw().save(picture)
+        with replacing(picture) as partial:
+            sheet.draw().save(partial, "PNG", pnginfo=tag)
     except OSError as error:
         raise UserError(f"'{picture}' cannot be written ({error.strerror or error}); mend its "
                         f"permissions.") from error
@@ -92,7 +102,7 @@ class _Sheet:
         for sensor, target, camera in zip(scene.sensors, scene.targets, self.cameras, strict=True):
             image, clipped = record.photographs.get(sensor.id(), (None, 0.0))
             name = f"{sensor.id()} ({Path(image).name})" if image else sensor.id()
-            self.thumbnails.append(Thumbnail.of(name, target.rgba, camera, clipped))
+            self.thumbnails.append(Thumbnail.of(name, target.rgba, camera, clipped, target.known))
         box = np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
         self.warnings = find_trouble(self.thumbnails, box, record.to_scene,
                                      has_alpha=all(target.has_alpha for target in scene.targets))
@@ -129,7 +139,8 @@ class _Sheet:
         sizes = {(camera.width, camera.height) for camera in self.cameras}
         about = (f"{self.scene.path.name}: {len(self.cameras)} views of "
                  f"{' / '.join(f'{w} x {h}' for w, h in sorted(sizes)[:3])} pixels, box ({low}) to ({high})")
-        legend = "orange: box   magenta: visual hull   red, green, blue: x, y, z   red camera: the first"
+        legend = ("orange: box   magenta: visual hull   red, green, blue: x, y, z   blue areas: unknown   "
+                  "red camera: the first")
         warnings = self.warnings or ["No trouble found."]
         lines = [(about, _INK), (legend, _INK)]
         for warning in warnings:
@@ -146,6 +157,8 @@ class _Sheet:
         size = (max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
         brightest = max(np.quantile(rgba[..., :3], 0.995), 1e-6)
         exposed = rgba[..., :3] / max(brightest, 1.0) + (1 - rgba[..., 3:]) * 0.15
+        known = self.scene.targets[index].known[..., None]
+        exposed = known * exposed + (1 - known) * (0.4 * exposed + 0.6 * np.array(_UNKNOWN))
         image = Image.fromarray((srgb(exposed) * 255).astype(np.uint8)).resize(size, Image.Resampling.BOX)
         camera = camera.resized(*size)
         if self.hull is not None:
@@ -217,7 +230,7 @@ def _hull(scene: FitScene, silhouettes: list[Silhouette]) -> mi.Scene | None:
                          np.array([(s.camera.width, s.camera.height) for s in seen]),
                          np.array([s.camera.center for s in seen]),
                          np.array([s.camera.basis() for s in seen]))
-    distance = visual_hull(points, views, [s.alpha for s in seen],
+    distance = visual_hull(points, views, [s.possible for s in seen],
                            daylight_votes=FitConfig().hull_daylight_votes)
     sdf = np.clip(distance.numpy() / np.abs(np.linalg.det(
         np.array(scene.subject.to_world.matrix)[:3, :3])) ** (1 / 3), -1, 1)

@@ -28,8 +28,17 @@ class CaptureConfig:
     one, else alpha."""
     invert_masks: bool = False
     """The mask images are black on the object instead of white."""
+    ignore: Path | None = None
+    """Folder of ignore masks, white where a photograph tells nothing, named like the images; default:
+    "ignore" beside the images if there is one."""
+    make_masks: str = "grabcut"
+    """How masks are made where there are none: grabcut (extra "masks"), rembg (a network, extra "rembg") or
+    off."""
+    frames: int = 80
+    """Frames to take from a video."""
     background: str | None = None
-    """Colour behind the object that makes the masks: white, black, '#00ff00' ..."""
+    """Colour behind the object that makes the masks (white, black, '#00ff00' ...), or a photograph of the
+    place without the object, by the same unmoved camera."""
     background_tolerance: float = 0.1
     """Distance from --background, of the encoded range 0 to 1, from which on a pixel is the object's."""
     color_space: str = "sRGB"
@@ -72,6 +81,10 @@ class CaptureConfig:
             raise UserError(f"--resolution must be at least 4 cells, not {self.resolution}.")
         if self.up not in (*AXES, "auto", "cameras", "keep"):
             raise UserError(f"--up '{self.up}' is unknown; choose {', '.join(AXES)}, cameras, keep or auto.")
+        if self.make_masks not in ("grabcut", "rembg", "off"):
+            raise UserError(f"--make-masks '{self.make_masks}' is unknown; choose grabcut, rembg or off.")
+        if self.frames < 3:
+            raise UserError(f"--frames must be at least 3, not {self.frames}.")
         if self.background is not None and self.masks is not None:
             raise UserError("Both --background and --masks are given; choose one.")
         for option, path in (("--light", self.light), ("--exposures", self.exposures)):

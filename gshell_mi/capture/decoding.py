@@ -11,10 +11,11 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 from PIL import ExifTags, Image, ImageCms
-from skimage.io import imread
 
+from .. import float_images
 from ..compat import colour_science
 from ..errors import UserError
+from . import tiff
 
 #: Formats that hold floating point values, linear unless told otherwise, colour premultiplied by alpha.
 FLOAT_SUFFIXES = (".exr", ".hdr", ".pfm")
@@ -45,7 +46,9 @@ def image_size(path: Path) -> tuple[int, int]:
         raise UserError(f"Image '{path}' is missing; the capture names it, so put it there.")
     try:
         if path.suffix.lower() in FLOAT_SUFFIXES:
-            return tuple(mi.Bitmap(str(path)).size())
+            return float_images.image_size(path)
+        if path.suffix.lower() in tiff.SUFFIXES:
+            return tiff.tiff_size(path)
         with Image.open(path) as image:
             return image.size
     except Exception as error:
@@ -71,10 +74,9 @@ def read_pixels(path: Path) -> np.ndarray:
     if pixels.ndim != 3 or pixels.shape[2] > 4 or pixels.dtype.kind not in "uf":
         raise UserError(f"Image '{path}' has the layout {pixels.shape} of {pixels.dtype}; write it as a "
                         f"grey, RGB or RGBA image of 8, 16 or floating point bits.")
-    if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
-        row, column = np.argwhere(~np.isfinite(pixels).all(axis=-1))[0]
-        raise UserError(f"Image '{path}' holds NaN or infinity (first at column {column}, row {row}); mend "
-                        f"those pixels.")
+    if pixels.dtype.kind == "f" and (bad := float_images.first_not_finite(pixels)):
+        raise UserError(f"Image '{path}' holds NaN or infinity (first at column {bad[0]}, row {bad[1]}); "
+                        f"mend those pixels.")
     grey, alpha = pixels[..., :1], pixels[..., 1:]
     if pixels.shape[2] <= 2:
         pixels = np.concatenate([grey, grey, grey, alpha], axis=-1)
@@ -84,12 +86,9 @@ def read_pixels(path: Path) -> np.ndarray:
 def _read(path: Path) -> np.ndarray:
     suffix = path.suffix.lower()
     if suffix in FLOAT_SUFFIXES:
-        bitmap = mi.Bitmap(str(path))
-        if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
-            bitmap = dict(bitmap.split())["<root>"]    # the unnamed layer, beside depth, normals and so on
-        return np.array(bitmap.convert(component_format=mi.Struct.Type.Float32))
-    if suffix in (".tif", ".tiff"):
-        return imread(path)
+        return float_images.read_float_image(path)[0]
+    if suffix in tiff.SUFFIXES:
+        return tiff.read_tiff(path)
     with Image.open(path) as image:
         image.load()    # complains of files that are cut off, unlike libpng through Mitsuba
         if _is_deep_png(path):
@@ -186,6 +185,17 @@ def color_profile(path: Path) -> str | None:
         return ImageCms.getProfileDescription(io.BytesIO(profile)).strip() if profile else None
     except (OSError, SyntaxError, ValueError, ImageCms.PyCMSError):
         return None
+
+
+def exif_orientation(path: Path) -> int:
+    """How a photograph is to be turned for people, 1 to 8 as in EXIF; 1, as stored, if it does not tell."""
+    if path.suffix.lower() not in _EXIF_SUFFIXES:
+        return 1
+    try:
+        with Image.open(path) as image:
+            return int(image.getexif().get(ExifTags.Base.Orientation, 1))
+    except (OSError, SyntaxError, TypeError, ValueError):
+        return 1
 
 
 def exif_exposure(path: Path) -> float | None:

@@ -21,12 +21,14 @@ class Frame:
         camera: with the size of the image file.
         mask: the file of its coverage, if the format names one.
         held_out: kept for measuring; the fit does not see it.
+        ignored: the file of its ignore mask, white where nothing is known, if there is one.
     """
 
     image: Path
     camera: Camera
     mask: Path | None = None
     held_out: bool = False
+    ignored: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Capture:
         up: unit direction that the format says is up; None if it says nothing.
         region: (2, 3) corners of a box that the format says holds the object, or None.
         has_opengl_axes: the format's camera axes are right, up, backward, which exporters get wrong.
+        notes: what the user should know of how the files were read, a sentence each.
     """
 
     format: str
@@ -48,6 +51,7 @@ class Capture:
     up: np.ndarray | None = None
     region: np.ndarray | None = None
     has_opengl_axes: bool = False
+    notes: tuple[str, ...] = ()
 
     @property
     def training(self) -> tuple[Frame, ...]:
@@ -72,7 +76,7 @@ def pose_of(matrix: object, owner: str) -> np.ndarray:
     """
     try:
         array = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, RecursionError):
         array = np.zeros(0)
     if array.shape == (3, 4):
         array = np.concatenate([array, [[0, 0, 0, 1]]])

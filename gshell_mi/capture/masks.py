@@ -10,7 +10,9 @@ from PIL import ImageColor
 
 from ..errors import UserError
 from .decoding import SUFFIXES, images_in, read_pixels
+from .file_names import Copies, existing
 from .frames import Capture, Frame
+from .reduced import match_frame, read_reduced_grey
 
 #: Folders that data sets keep masks in, beside the images' folder or in the capture's.
 _FOLDERS = ("masks", "mask")
@@ -59,8 +61,9 @@ class Background:
 def assign_masks(capture: Capture, folder: Path | None) -> Capture:
     """Finds the mask file of each frame.
 
-    Masks are matched to images by name (``IMG_1.png`` or ``IMG_1.jpg.png`` for ``IMG_1.jpg``, sub-folders
-    alike), or all by their order if no name matches and there are as many.
+    Masks are matched to images by name (``IMG_1.png`` or ``IMG_1.jpg.png`` for ``IMG_1.jpg``), in the same
+    sub-folders where several images have one name, or all by their order if no name matches and there are as
+    many.
 
     Args:
         folder: where they are; default: ``masks`` or ``mask`` if there is one, unless the format names
@@ -75,13 +78,18 @@ def assign_masks(capture: Capture, folder: Path | None) -> Capture:
             if missing:
                 raise UserError(f"The capture names masks, but none for '{missing.image}'; add it, or give "
                                 f"a folder of masks with --masks.")
+            lost = next((frame.mask for frame in capture.frames if not frame.mask.is_file()), None)
+            if lost:
+                raise UserError(f"Mask '{lost}' is missing, with or without a suffix such as .png; put it "
+                                f"there, or give a folder of masks with --masks.")
             return capture
         folder = _beside(capture)
         if folder is None:
             return capture
     elif not folder.is_dir():
         raise UserError(f"Mask folder '{folder}' does not exist; correct --masks.")
-    found = [_match(folder, frame.image) for frame in capture.frames]
+    copies = Copies(frame.image.as_posix() for frame in capture.frames)
+    found = [copies.find(folder, frame.image.as_posix(), mask_of) for frame in capture.frames]
     if not any(found):
         inside = images_in(folder)
         if len(inside) != len(capture.frames):
@@ -106,38 +114,41 @@ def _beside(capture: Capture) -> Path | None:
     return None
 
 
-def _match(folder: Path, image: Path) -> Path | None:
-    # An image in a sub-folder of images/ may have its mask in the same sub-folder of masks/.
-    for inside in (folder, folder / image.parent.name):
-        for name in (image.name, image.name + ".png", *(image.stem + suffix for suffix in SUFFIXES)):
-            if (inside / name).is_file():
-                return inside / name
-    return None
+def mask_of(image: Path) -> Path | None:
+    """The mask in the place of an image."""
+    names = (image.name, image.name + ".png", *(image.stem + suffix for suffix in SUFFIXES))
+    exact = next((image.with_name(name) for name in names if image.with_name(name).is_file()), None)
+    return exact or existing(image.with_name(image.stem)) or existing(image)
 
 
 def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None = None, *,
-                inverted: bool = False) -> np.ndarray:
+                inverted: bool = False, reduction: int = 1) -> np.ndarray:
     """(h, w) coverage in [0, 1] of a frame with the given stored pixels.
 
     A given background colour comes first, then the frame's mask, then alpha.
 
     Args:
         inverted: mask files are black on the object.
+        reduction: of the pixels, see ``read_reduced``.
 
     Raises:
-        UserError: there is none of them, or the mask has another size than the image.
+        UserError: there is none of them, or the mask has another aspect than the image.
     """
     if background is not None:
         return background.coverage(_unit(pixels[..., :3])).astype(np.float32)
+    size = (frame.camera.width, frame.camera.height)
     if frame.mask is not None:
+        grey = read_reduced_grey(frame.mask, size, reduction)
+        if grey is not None:
+            return 1 - grey if inverted else grey
         mask = read_pixels(frame.mask)
-        if mask.shape[:2] != pixels.shape[:2]:
-            raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "
-                            f"is {pixels.shape[1]} x {pixels.shape[0]}; resize it.")
         # Some tools put the mask into alpha and leave the colour empty or as it was.
         in_alpha = mask.shape[2] == 4 and _unit(mask[..., 3]).min() < 1
         values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
-        coverage = np.clip(_unit(values, mask.dtype), 0, 1)
+        coverage = match_frame(np.clip(_unit(values, mask.dtype), 0, 1), frame, pixels.shape[:2], reduction)
+        if coverage is None:
+            raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "
+                            f"is {size[0]} x {size[1]}; resize it.")
         return 1 - coverage if inverted else coverage
     if pixels.shape[2] < 4:
         raise UserError(f"Image '{frame.image}' has no alpha, and there is no mask for it; {_SUPPLY}.")

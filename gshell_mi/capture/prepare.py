@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,12 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
+from ..json_files import read_json_object
 from .camera import Camera
-from .decoding import FLOAT_SUFFIXES, ColorDecoding, exif_exposure, read_pixels
+from .decoding import FLOAT_SUFFIXES, ColorDecoding, exif_exposure
+from .evidence import read_ignored, wide_grey
 from .frames import Capture, Frame
 from .masks import Background, coverage_of
-from .resample import rectify, shrink
+from .reduced import read_reduced, reduced_camera
+from .resample import framed, rectify, shrink
 
+#: A JPEG is decoded at no less than so many times the size of its target, so that most of the averaging is
+#: of linear values.
+_DECODED = 2
 #: Half floats end at 65504; a target there is far beyond what a photograph holds.
 _BRIGHTEST = 6e4
 
@@ -28,11 +33,16 @@ class Prepared:
         rgba: (height, width, 4) float32, linear Rec.709, premultiplied by alpha = coverage.
         camera: the one with square pixels and without distortion that sees it.
         clipped: share of the object's pixels at the largest value of an integer file.
+        covered: the largest coverage of any pixel of the photograph.
+        known: (height, width) share of each pixel of which the photograph tells whether it is the object's;
+            None if that is all of every pixel.
     """
 
     rgba: np.ndarray
     camera: Camera
     clipped: float
+    covered: float
+    known: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -59,8 +69,9 @@ class Preparation:
         Raises:
             UserError: the image or its mask cannot be used.
         """
-        pixels = read_pixels(frame.image)
-        coverage = coverage_of(frame, pixels, self.background, inverted=self.inverted_masks)[..., None]
+        pixels, reduction = read_reduced(frame.image, _DECODED * self.max_size)
+        coverage = coverage_of(frame, pixels, self.background, inverted=self.inverted_masks,
+                               reduction=reduction)[..., None]
         rgb = self.decoding.linear(pixels[..., :3])
         # In place, for a photograph of 24 megapixels takes 300 MB by now.
         if self.background is not None:
@@ -69,9 +80,24 @@ class Preparation:
             rgb *= coverage
         rgb *= np.float32(self.gains.get(frame.image, 1.0))
         np.clip(rgb, 0.0, _BRIGHTEST, out=rgb)
-        image = np.concatenate([rgb, coverage], axis=-1)
+        known = self._known(frame, coverage, reduction)
+        image = np.concatenate([rgb, coverage, known], axis=-1)
         # The lens formula is in units of the focal length, so it holds for the small image, at less cost.
-        return Prepared(*rectify(*shrink(image, frame.camera, self.max_size)), _clipped(pixels, coverage))
+        small, camera = shrink(image, reduced_camera(frame.camera, reduction), self.max_size)
+        inside = framed(camera)
+        image, camera = rectify(small, camera)
+        known = image[..., 4] * inside
+        return Prepared(image[..., :4], camera, _clipped(pixels, coverage), float(coverage.max()),
+                        None if known.all() else known)
+
+    def _known(self, frame: Frame, coverage: np.ndarray, reduction: int) -> np.ndarray:
+        """(h, w, 1) the share of each pixel of which something is known."""
+        known = np.ones_like(coverage)
+        if self.background is None and frame.mask is not None:
+            known[wide_grey(coverage[..., 0])] = 0
+        if frame.ignored is not None:
+            known[..., 0] *= 1 - read_ignored(frame, coverage.shape[:2], reduction)
+        return known
 
     @staticmethod
     def _encoded(color: tuple[float, float, float], dtype: np.dtype) -> np.ndarray:
@@ -117,9 +143,8 @@ def exposure_gains(capture: Capture, file: Path | None, *, exif: bool = True) ->
 
 def _stops_from_file(file: Path, images: list[Path]) -> list[float]:
     try:
-        table = json.loads(file.read_text(encoding="utf-8-sig"))
-        table = {str(name): float(value) for name, value in table.items()}
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+        table = {name: float(value) for name, value in read_json_object(file).items()}
+    except (OSError, ValueError, TypeError, OverflowError) as error:
         raise UserError(f"--exposures '{file}' is no JSON object of stops by file name ({error}); write "
                         f"{{\"IMG_1.jpg\": 0.0, \"IMG_2.jpg\": -1.5}}.") from error
     for image in images:

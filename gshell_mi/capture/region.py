@@ -13,6 +13,8 @@ from .camera import Camera
 MASK_SIZE = 160
 #: Points per side of the grid that is carved.
 _GRID = 48
+#: Views, at most, whose common volume all are held against.
+_MOST_JUDGES = 64
 #: Share of the box's half side that the common volume fills.
 _FILL = 0.92
 
@@ -24,10 +26,17 @@ class Silhouette:
     Attributes:
         camera: for the mask's size; no distortion.
         alpha: (height, width) coverage.
+        known: (height, width) share of each pixel of which coverage is known; None is everything.
     """
 
     camera: Camera
     alpha: np.ndarray
+    known: np.ndarray | None = None
+
+    @property
+    def possible(self) -> np.ndarray:
+        """(height, width) the largest coverage that what is known allows."""
+        return self.alpha if self.known is None else np.maximum(self.alpha, 1 - self.known)
 
     @property
     def is_empty(self) -> bool:
@@ -69,16 +78,17 @@ class Carving:
     """The volume that all masks share, tested at points.
 
     A point is kept if no view excludes it by more than ``slack``, so that a coarse grid misses nothing
-    thin. A view excludes what falls beside its mask, and what it does not frame if its mask keeps
-    clear of the border, for then it shows the whole object. Daylight that a mask encloses excludes nothing,
-    as in ``fields.visual_hull``.
+    thin. A view excludes what falls beside its mask and what is unknown there, and what it does not frame if
+    its mask keeps clear of the border, for then it shows the whole object. Daylight that a mask encloses
+    excludes nothing, as in ``fields.visual_hull``.
     """
 
     def __init__(self, silhouettes: list[Silhouette]):
         self._views = []
         for silhouette in silhouettes:
-            inside = ndimage.binary_fill_holes(silhouette.alpha >= 0.5)
-            whole = not (inside[[0, -1]].any() or inside[:, [0, -1]].any())
+            inside = ndimage.binary_fill_holes(silhouette.possible >= 0.5)
+            mask = silhouette.alpha >= 0.5
+            whole = not (mask[[0, -1]].any() or mask[:, [0, -1]].any())
             self._views.append((silhouette.camera, ndimage.distance_transform_edt(~inside), whole))
 
     def keeps(self, points: np.ndarray, slack: float) -> np.ndarray:
@@ -142,8 +152,10 @@ def find_box(silhouettes: list[Silhouette], region: np.ndarray | None = None) ->
 def agreement(silhouettes: list[Silhouette], box: np.ndarray, rays: int = 32) -> np.ndarray:
     """Per view the share of its mask that the volume common to all masks, inside the box, explains.
 
-    With right cameras it is 1 up to the masks' errors.
+    With right cameras it is 1 up to the masks' errors. Of very many views, some spread over the rest make up
+    the common volume, so that the time grows with the number of views and not with its square.
     """
+    judges = silhouettes[::-(-len(silhouettes) // _MOST_JUDGES)]
     rng = np.random.default_rng(0)
     center, half = box.mean(axis=0), np.ptp(box, axis=0).max() / 2
     # Along a ray, from its entry into the sphere around the box to its exit.
@@ -163,7 +175,7 @@ def agreement(silhouettes: list[Silhouette], box: np.ndarray, rays: int = 32) ->
     flat = points.reshape(-1, 3)
     boxed = np.flatnonzero((np.abs(flat - center) <= half).all(axis=1))
     slack = np.sqrt(3) * half / (len(steps) - 1)
-    kept = boxed[Carving(silhouettes).keeps(flat[boxed], slack)]
+    kept = boxed[Carving(judges).keeps(flat[boxed], slack)]
     hit = np.zeros(len(flat), bool)
     hit[kept] = True
     share = hit.reshape(len(silhouettes), rays, -1).any(axis=2).mean(axis=1)

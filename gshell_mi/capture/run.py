@@ -11,20 +11,33 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from ..compat import write_bitmap
+from ..environment_maps import read_environment_map
 from ..errors import UserError
+from ..float_images import is_exr
+from ..interrupt import check_interrupt
+from ..scene_inputs import scene_inputs
+from ..wording import counted
+from .acquire import acquire, lacks_masks, make_masks
 from .camera import Camera
 from .config import AXES, CaptureConfig
-from .decoding import ColorDecoding, color_profile
-from .formats import read_capture
+from .decoding import FLOAT_SUFFIXES, ColorDecoding, color_profile, exif_orientation
+from .evidence import assign_ignored
+from .formats import mitsuba
 from .frames import Capture, Frame
 from .masks import Background, assign_masks
+from .parallel import in_order
 from .prepare import Preparation, exposure_gains
 from .region import FLIPPED_AXES, find_box, likely_misreading
+from .staging import staged
 from .trouble import Thumbnail, find_trouble
-from .writer import scene_xml, sensors_xml, staged, write_record, write_target
+from .workspace import Progress
+from .writer import clipping_depths, scene_xml, sensors_xml, write_known, write_record, write_target
 
 #: An object farther from the origin than so many of its sizes is moved there.
 _FAR = 50.0
+#: Masks whose largest coverage is less do not reach white; a rounded one may miss it by a little.
+_FAINT_MASK = 0.95
 
 
 @dataclass(frozen=True)
@@ -36,6 +49,7 @@ class CaptureResult:
         training, held_out: numbers of views.
         box: (2, 3) corners of the lattice's cube, in the scene.
         warnings: what is likely wrong, a sentence each.
+        made: what was made because it was not there: "cameras", "masks".
     """
 
     path: Path
@@ -43,46 +57,62 @@ class CaptureResult:
     held_out: int
     box: np.ndarray
     warnings: tuple[str, ...]
+    made: tuple[str, ...] = ()
 
 
 def import_capture(source: str | Path, output: str | Path, *, config: CaptureConfig | None = None,
                    overwrite: bool = False,
-                   progress: Callable[[int, int], None] | None = None) -> CaptureResult:
-    """Turns photographs with known cameras into a fit scene.
+                   progress: Callable[[int, int], None] | None = None,
+                   steps: Progress | None = None) -> CaptureResult:
+    """Turns photographs into a fit scene; cameras and masks that they lack are made.
 
     A Mitsuba ``llvm`` or ``cuda`` variant must be set. Writes ``output`` (an XML file) and beside it the
     folder of its stem: targets ``view_000.exr`` and so on, ``sensors.xml``, ``capture.json`` (which view is
     which photograph, how the world was moved) and, if there are held-out views, ``test.xml`` with
-    ``test/test_000.exr`` and so on. Either all of that or, on an error, nothing.
+    ``test/test_000.exr`` and so on. Either all of that or, on an error, nothing. Cameras, masks and the
+    frames of a video are kept in a folder beside it, whose name ends in ``.work``, from where a second call
+    takes them.
 
     Args:
-        source: the capture's folder or main file.
+        source: the capture's folder or main file, a folder of photographs, or a video.
         output: the fit scene to write.
         config: see ``CaptureConfig``.
         overwrite: replace what an earlier import wrote.
         progress: called with (photographs done, photographs).
+        steps: called with (what, done, in all) in the steps before, which only captures without cameras or
+            masks have.
 
     Raises:
         UserError: of anything in the capture or the options that the user can mend.
     """
     config = config or CaptureConfig()
     source, output = Path(source), Path(output)
-    with staged(output, overwrite=overwrite, source=source) as partial:
-        return _Import(source, output, config, progress).write(partial)
+    with staged(output, overwrite=overwrite, source=source) as staging:
+        work = _Import(source, output, config, progress, steps)
+        staging.check_inputs(work.inputs())
+        return work.write(staging.path)
 
 
 class _Import:
     def __init__(self, source: Path, output: Path, config: CaptureConfig,
-                 progress: Callable[[int, int], None] | None):
+                 progress: Callable[[int, int], None] | None, steps: Progress | None):
         self.config, self.output, self.progress = config, output, progress
         decoding = ColorDecoding(config.color_space, config.transfer)
         background = None
-        if config.background is not None:
+        if config.background is not None and not Path(config.background).is_file():
             background = Background.parse(config.background, config.background_tolerance)
-        capture = read_capture(source, format=config.format, images=config.images,
-                               opencv_axes=config.opencv_axes)
+
+        def told(what: str, done: int, count: int) -> None:
+            check_interrupt()
+            if steps:
+                steps(what, done, count)
+
+        acquired = acquire(source, output, config, told)
         if background is None:
-            capture = assign_masks(capture, config.masks)
+            acquired.capture = assign_masks(acquired.capture, config.masks)
+            if config.make_masks != "off" and lacks_masks(acquired.capture):
+                make_masks(acquired, config, lambda capture: to_scene(capture, config.up), told)
+        capture, self.made = assign_ignored(acquired.capture, config.ignore), tuple(acquired.made)
         if config.hold_out:
             capture = capture.holding_out(config.hold_out)
         if not capture.training:
@@ -92,11 +122,22 @@ class _Import:
             replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames))
         gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
         self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains)
-        self.warnings = _profile_warning(capture, config)
+        self.warnings = [*capture.notes, *_profile_warning(capture, config)]
+        if "masks" not in self.made:
+            self.warnings += _turned_warning(capture)
         self.cameras: dict[str, Camera] = {}
         self.tests: dict[str, Camera] = {}
         self.thumbnails: list[Thumbnail] = []
         self.views: list[dict] = []
+
+    def inputs(self) -> set[Path]:
+        """The files that are read and could be mistaken for some that are written."""
+        files = {file for frame in self.capture.frames for file in (frame.image, frame.mask, frame.ignored)
+                 if file}
+        files |= {Path(file) for file in (self.config.light, self.config.background) if file is not None}
+        if self.capture.format == mitsuba.NAME:
+            files |= scene_inputs(mitsuba.find(self.capture.source))
+        return files
 
     def write(self, partial: Path) -> CaptureResult:
         stem = self.output.stem
@@ -105,41 +146,57 @@ class _Import:
         box = self._box()
         self.warnings += find_trouble(self.thumbnails, box, self.to_scene)
         box = self._brought_near(box)
-        (folder / "sensors.xml").write_text(sensors_xml(self.cameras, box), encoding="utf-8")
+        depth = clipping_depths([*self.cameras.values(), *self.tests.values()], box)
+        (folder / "sensors.xml").write_text(sensors_xml(self.cameras, depth), encoding="utf-8")
         if self.tests:
-            (folder / "test.xml").write_text(sensors_xml(self.tests, box), encoding="utf-8")
+            (folder / "test.xml").write_text(sensors_xml(self.tests, depth), encoding="utf-8")
         document = scene_xml(stem, box, self.config.resolution, self._copy_light(folder))
-        (partial / self.output.name).write_text(document, encoding="utf-8")
+        # Names that the locale cannot spell come as escaped bytes, and go back as these.
+        (partial / self.output.name).write_text(document, encoding="utf-8", errors="surrogateescape")
         write_record(folder, self._record(box))
-        return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings))
+        return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings),
+                             self.made)
 
     def _write_targets(self, folder: Path) -> None:
-        empty = []
-        for index, frame in enumerate(self.capture.frames):
-            target = self.preparation.target(frame)
+        empty, faint, most, frames = [], {}, 0.0, self.capture.frames
+        # Mitsuba's reader of floating point files has threads of its own.
+        threads = 1 if any(frame.image.suffix.lower() in FLOAT_SUFFIXES for frame in frames) else None
+        targets = in_order(self.preparation.target, frames, threads=threads)
+        for index, (frame, target) in enumerate(zip(frames, targets, strict=True)):
+            check_interrupt()
+            most = max(most, target.covered)
             if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
                 empty.append(frame.image.name)    # it would carve away everything that it frames
                 continue
+            if target.covered < _FAINT_MASK:
+                faint[frame.image.name] = target.covered
             name = f"test_{len(self.tests):03}" if frame.held_out else f"view_{len(self.cameras):03}"
+            place = folder / "test" if frame.held_out else folder
+            place.mkdir(exist_ok=True)
+            write_target(place / f"{name}.exr", target.rgba)
+            if target.known is not None:
+                write_known(place / f"{name}.exr", target.known)
             if frame.held_out:
-                (folder / "test").mkdir(exist_ok=True)
-                write_target(folder / "test" / f"{name}.exr", target.rgba)
                 self.tests[name] = target.camera
             else:
-                write_target(folder / f"{name}.exr", target.rgba)
                 self.cameras[name] = target.camera
-                label = f"{name} ({frame.image.name})"
-                self.thumbnails.append(Thumbnail.of(label, target.rgba, target.camera, target.clipped))
+                self.thumbnails.append(Thumbnail.of(f"{name} ({frame.image.name})", target.rgba,
+                                                    target.camera, target.clipped, target.known))
             self.views.append(self._view_record(name, frame, target.clipped))
             if self.progress:
                 self.progress(index + 1, len(self.capture.frames))
         if not self.cameras:
-            raise UserError(f"The masks of all images of '{self.capture.source}' are empty; masks are white, "
-                            f"and alpha is 1, on the object.")
+            raise UserError(f"The masks of all images of '{self.capture.source}' are empty (their largest "
+                            f"coverage is {most:.2g}); masks are white, and alpha is 1, on the object.")
         if empty:
             some = ", ".join(empty[:3]) + (" ..." if len(empty) > 3 else "")
             what = "view with an empty mask is" if len(empty) == 1 else "views with empty masks are"
             self.warnings.append(f"{len(empty)} {what} left out: {some}.")
+        if faint:
+            some = ", ".join(f"{name} ({share:.2f})" for name, share in list(faint.items())[:3])
+            self.warnings.append(f"{counted(len(faint), 'mask')} nowhere reach full coverage; the largest is "
+                                 f"{some}{' ...' if len(faint) > 3 else ''}: the object counts as half "
+                                 f"transparent; write masks that are white (255, 1.0) on the object.")
 
     def _box(self) -> np.ndarray:
         if self.config.box is not None:
@@ -178,14 +235,13 @@ class _Import:
         """The name of the copy, relative to the XML file."""
         if self.config.light is None:
             return None
-        try:
-            mi.Bitmap(str(self.config.light))
-        except Exception as error:
-            reason = (str(error).strip().splitlines() or [repr(error)])[0]
-            raise UserError(f"--light '{self.config.light}' cannot be read as an image ({reason}); give an "
-                            f"environment map such as an OpenEXR file.") from error
+        radiance = read_environment_map(self.config.light, "--light")
         name = "light" + self.config.light.suffix
-        shutil.copyfile(self.config.light, folder / name)
+        if is_exr(self.config.light):    # whatever its layers and windows are, Mitsuba reads the copy
+            name = "light.exr"
+            write_bitmap(mi.Bitmap(radiance), folder / name)
+        else:
+            shutil.copyfile(self.config.light, folder / name)
         return f"{self.output.stem}/{name}"
 
     def _view_record(self, name: str, frame: Frame, clipped: float) -> dict:
@@ -217,6 +273,20 @@ def _profile_warning(capture: Capture, config: CaptureConfig) -> list[str]:
         return []
     return [f"The photographs carry the colour profile '{profile}', but are read as sRGB: name their colour "
             f"space with --color-space."]
+
+
+def _turned_warning(capture: Capture) -> list[str]:
+    """If masks may be turned against photographs with an EXIF orientation, which their sizes do not tell."""
+    turned = [frame for frame in capture.frames
+              if frame.mask is not None and _is_ambiguous(exif_orientation(frame.image), frame.camera)]
+    if not turned:
+        return []
+    return [f"{counted(len(turned), 'photograph')} such as {turned[0].image.name} carry an EXIF orientation: "
+            f"their masks must be stored as their pixels are, not as viewers turn them."]
+
+
+def _is_ambiguous(orientation: int, camera: Camera) -> bool:
+    return orientation in (2, 3, 4) or (orientation > 4 and camera.width == camera.height)
 
 
 def to_scene(capture: Capture, up: str) -> np.ndarray:

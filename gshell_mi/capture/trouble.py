@@ -28,21 +28,25 @@ class Thumbnail:
         camera: of the small image.
         rgba: (height, width, 4) linear, premultiplied.
         clipped: share of the object's pixels that the photograph clipped, as far as known.
+        known: (height, width) share of each pixel of which coverage is known; None is everything.
     """
 
     name: str
     camera: Camera
     rgba: np.ndarray
     clipped: float = 0.0
+    known: np.ndarray | None = None
 
     @classmethod
-    def of(cls, name: str, rgba: np.ndarray, camera: Camera, clipped: float = 0.0) -> Thumbnail:
-        small, camera = shrink(rgba, camera, MASK_SIZE)
-        return cls(name, camera, small, clipped)
+    def of(cls, name: str, rgba: np.ndarray, camera: Camera, clipped: float = 0.0,
+           known: np.ndarray | None = None) -> Thumbnail:
+        small, small_camera = shrink(rgba, camera, MASK_SIZE)
+        known = None if known is None else shrink(known[..., None], camera, MASK_SIZE)[0][..., 0]
+        return cls(name, small_camera, small, clipped, known)
 
     @property
     def silhouette(self) -> Silhouette:
-        return Silhouette(self.camera, self.rgba[..., 3])
+        return Silhouette(self.camera, self.rgba[..., 3], self.known)
 
 
 def find_trouble(thumbnails: list[Thumbnail], box: np.ndarray, to_scene: np.ndarray, *,

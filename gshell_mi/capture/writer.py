@@ -1,14 +1,9 @@
-"""A capture as a fit scene: XML, sensors, targets; all of it or nothing."""
+"""A capture as a fit scene: XML, sensors, targets."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -17,10 +12,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..compat import write_bitmap
-from ..errors import UserError
 from .camera import Camera
 
-#: Marks a folder as written by this module, which may then replace it; says where everything came from.
+#: Says where everything came from.
 RECORD = "capture.json"
 
 
@@ -49,14 +43,26 @@ def sensor_xml(name: str, camera: Camera, depth: tuple[float, float]) -> str:
 """
 
 
-def sensors_xml(cameras: dict[str, Camera], box: np.ndarray) -> str:
-    """A scene document of the sensors, with clipping planes that hold the box (2, 3)."""
+def clipping_depths(cameras: list[Camera], box: np.ndarray) -> tuple[float, float]:
+    """Near and far clipping distances that hold the box (2, 3) for each of the cameras.
+
+    They are the same for all, and powers of two: Mitsuba compiles them into its kernels as constants, so each
+    pair of numbers that is new costs a compilation, in this import and in the next.
+
+    >>> camera = Camera(4, 4, 4.0, 4.0, 2.0, 2.0, np.eye(4))
+    >>> clipping_depths([camera], np.array([[-1.0, -1.0, 9.0], [1.0, 1.0, 11.0]]))
+    (2.0, 256.0)
+    """
     reach = float(np.linalg.norm(np.ptp(box, axis=0)))
-    parts = []
-    for name, camera in cameras.items():
-        distance = float(np.linalg.norm(camera.center - box.mean(axis=0)))
-        parts.append(sensor_xml(name, camera, (max(1e-2 * distance, distance - 2 * reach),
-                                               10 * (distance + reach))))
+    distances = [float(np.linalg.norm(camera.center - box.mean(axis=0))) for camera in cameras]
+    near = min(max(1e-2 * distance, distance - 2 * reach) for distance in distances)
+    far = 10 * (max(distances) + reach)
+    return 2.0 ** math.floor(math.log2(max(near, 1e-6 * far))), 2.0 ** math.ceil(math.log2(far))
+
+
+def sensors_xml(cameras: dict[str, Camera], depth: tuple[float, float]) -> str:
+    """A scene document of the sensors, with near and far clipping distance ``depth``."""
+    parts = [sensor_xml(name, camera, depth) for name, camera in cameras.items()]
     return '<scene version="3.0.0">\n    <default name="spp" value="256"/>\n' + "".join(parts) + "</scene>\n"
 
 
@@ -100,6 +106,16 @@ def write_target(path: Path, rgba: np.ndarray) -> None:
     write_bitmap(bitmap.convert(component_format=mi.Struct.Type.Float16), path)
 
 
+def write_known(path: Path, known: np.ndarray) -> None:
+    """Writes beside the target ``path`` what of it is known, (height, width) in [0, 1]; see ``targets``.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    bitmap = mi.Bitmap(np.ascontiguousarray(known[..., None], dtype=np.float32), mi.Bitmap.PixelFormat.Y)
+    write_bitmap(bitmap.convert(component_format=mi.Struct.Type.Float16), path.with_suffix(".known.exr"))
+
+
 def write_record(folder: Path, record: dict) -> None:
     text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
     (folder / RECORD).write_text(text, encoding="utf-8", errors="surrogateescape")
@@ -126,45 +142,3 @@ def read_record(folder: Path) -> Record:
         return Record(photographs, np.array(stored["capture_to_scene"], dtype=np.float64).reshape(4, 4))
     except (OSError, ValueError, KeyError, TypeError):
         return Record()
-
-
-@contextmanager
-def staged(output: Path, *, overwrite: bool, source: Path) -> Iterator[Path]:
-    """A temporary folder that becomes ``output`` (an XML file) and the folder of its stem at the end.
-
-    The block writes the XML file and that folder into it. If it fails, nothing remains and what was there
-    before is untouched.
-
-    Raises:
-        UserError: something is there already and may not be replaced, or the place cannot be written.
-    """
-    folder = output.with_suffix("")
-    if output.suffix != ".xml":
-        raise UserError(f"The output '{output}' must end in .xml; the targets go into a folder of the same "
-                        f"name beside it.")
-    if folder.exists() and folder.resolve() in (source.resolve(), *source.resolve().parents):
-        raise UserError(f"The output '{output}' would put its targets into '{folder}', where the capture is; "
-                        f"choose another name.")
-    if (output.exists() or folder.exists()) and not overwrite:
-        there = output if output.exists() else folder
-        raise UserError(f"'{there}' exists; replace it with --overwrite, or choose another output.")
-    if folder.exists() and not (folder / RECORD).is_file():
-        raise UserError(f"'{folder}' was not written by gshell_mi.capture, so --overwrite leaves it alone; "
-                        f"remove it or choose another output.")
-    partial = None
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        # On the same disk, so that moving it into place is a mere renaming.
-        partial = Path(tempfile.mkdtemp(prefix=f".{output.stem}.", suffix=".partial", dir=output.parent))
-        (partial / output.stem).mkdir()
-        yield partial
-        if folder.exists():
-            os.replace(folder, partial / "replaced")
-        os.replace(partial / output.stem, folder)
-        os.replace(partial / output.name, output)
-    except OSError as error:
-        raise UserError(f"'{output}' cannot be written ({error.strerror or error}); free some space, mend "
-                        f"its permissions or choose another output.") from error
-    finally:
-        if partial is not None:
-            shutil.rmtree(partial, ignore_errors=True)

@@ -15,6 +15,8 @@ from rich.table import Table
 from ..command_line import run_command
 from ..errors import UserError
 from ..evaluation import IMAGE_SCORES
+from ..files import replacing
+from ..wording import counted
 
 _MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 
@@ -52,12 +54,21 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _score(given: _Arguments) -> None:
     try:
+        if given.json and given.json.exists() and any(
+                path and path.exists() and path.samefile(given.json) for path in (given.first, given.second)):
+            raise UserError(f"'{given.json}' is compared, and --json would replace it; choose another file.")
         result = _compare(given)
         if given.json:
-            given.json.write_text(json.dumps(result, indent=1))
+            with replacing(given.json) as partial:
+                partial.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
-        raise UserError(f"'{error.filename}' cannot be written ({error.strerror}); choose another "
-                        f"place.") from error
+        raise UserError(f"'{error.filename or given.json or given.output}' cannot be written "
+                        f"({error.strerror or error}); choose another place.") from error
+    unmatched = result.get("unmatched")
+    if unmatched:
+        some = ", ".join(unmatched[:3]) + (" ..." if len(unmatched) > 3 else "")
+        print(f"warning: {counted(len(unmatched), 'image')} without a partner of the same name not compared: "
+              f"{some}.", file=sys.stderr)
     _show(result)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,8 +11,10 @@ import numpy as np
 from ..errors import UserError
 from ..evaluation import IMAGE_SCORES, albedo_scale, image_scores, mesh_scores, read_image
 from ..evaluation.mesh_scores import read_mesh
-from ..export.fitted_scene import load_fitted_scene, load_scene
+from ..export.fitted_scene import load_fitted_scene
 from ..images import over_white, write_png
+from ..json_files import read_json_object
+from ..scene_files import load_scene
 from ..targets import load_target
 
 Report = Callable[[int, int], None]
@@ -28,16 +29,16 @@ def compare_folders(first: Path, second: Path, errors: Path | None = None) -> di
         errors: folder for the FLIP maps (magma).
 
     Returns:
-        ``views`` (scores by name) and ``mean``.
+        ``views`` (scores by name), ``mean`` and ``unmatched``, the names in only one of the folders.
 
     Raises:
         UserError: a path is missing, the folders share no file, or images do not fit together.
     """
-    pairs = _pairs(Path(first), Path(second))
+    pairs, unmatched = _pairs(Path(first), Path(second))
     views = {}
     for name, (image, reference) in pairs.items():
         views[name] = _score(name, read_image(image), read_image(reference), errors)
-    return {"views": views, "mean": _mean(views)}
+    return {"views": views, "mean": _mean(views), "unmatched": unmatched}
 
 
 def compare_meshes(first: Path, second: Path) -> dict:
@@ -72,6 +73,8 @@ def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | No
     scene = load_fitted_scene(folder, envmap)
     targets = Path(targets) if targets else _recorded_targets(folder)
     cameras = load_scene(sensors).sensors() if sensors else scene.sensors()
+    if not cameras:
+        raise UserError(f"'{sensors}' has no sensors; give a scene file with some.")
     references = [load_target(targets / f"{camera.id()}.exr", *camera.film().crop_size()).rgba
                   for camera in cameras]
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
@@ -100,24 +103,28 @@ def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | No
 
 def _recorded_targets(folder: Path) -> Path:
     try:
-        return Path(json.loads((folder / "metrics.json").read_text())["targets"])
+        return Path(read_json_object(folder / "metrics.json")["targets"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"'{folder / 'metrics.json'}' does not tell where the targets are; name their folder "
                         f"with --targets.") from error
 
 
-def _pairs(first: Path, second: Path) -> dict[str, tuple[Path, Path]]:
+def _pairs(first: Path, second: Path) -> tuple[dict[str, tuple[Path, Path]], list[str]]:
+    """The files of equal names, whatever the case of their suffix, and those without a partner."""
     for path in (first, second):
         if not path.exists():
             raise UserError(f"'{path}' does not exist; check the path.")
     if first.is_dir() != second.is_dir():
         raise UserError(f"'{first}' and '{second}' are a folder and a file; give two of a kind.")
     if not first.is_dir():
-        return {first.stem: (first, second)}
-    names = sorted({p.name for p in first.glob("*.exr")} & {p.name for p in second.glob("*.exr")})
+        return {first.stem: (first, second)}, []
+    ours, theirs = ({path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".exr"}
+                    for folder in (first, second))
+    names = sorted(ours.keys() & theirs.keys())
     if not names:
         raise UserError(f"'{first}' and '{second}' have no EXR files of the same name; rename them in pairs.")
-    return {Path(name).stem: (first / name, second / name) for name in names}
+    unmatched = [str((ours | theirs)[name]) for name in sorted(ours.keys() ^ theirs.keys())]
+    return {name: (ours[name], theirs[name]) for name in names}, unmatched
 
 
 def _score(name: str, image: np.ndarray, reference: np.ndarray, errors: Path | None) -> dict[str, float]:

@@ -6,30 +6,50 @@ import numpy as np
 import trimesh
 
 from ..errors import UserError
+from ..mesh_files import check_triangles, read_triangles
 from ..topology import vertex_components
+from .orientation import oriented
+
+#: Vertices whose coordinates agree in so many decimals, in units of a lattice from -1 to 1, are one.
+_DECIMALS = 6
 
 
-def loaded_mesh(source: str | Path | trimesh.Trimesh, name: str) -> trimesh.Trimesh:
-    """The mesh of a file, or a copy: welded, no degenerate faces, no pinches, outward faces if closed.
+def loaded_mesh(source: str | Path | trimesh.Trimesh, name: str,
+                to_world: np.ndarray | None = None) -> trimesh.Trimesh:
+    """The mesh of a file, or a copy, in lattice units.
+
+    It is welded, has no repeated faces, whichever way they face, no degenerate ones and no pinches; its
+    pieces are oriented evenly, each as most of its area was, and closed ones outwards.
+
+    Args:
+        source: a file that trimesh reads, or a mesh.
+        name: what it is called in messages.
+        to_world: 4 x 4 matrix from lattice units to those of the mesh; identity by default.
 
     Raises:
-        UserError: the file cannot be read or holds no triangles; ``name`` is what it is called.
+        UserError: the file cannot be read, holds no triangles with an area, or positions that are NaN,
+            infinite or missing.
     """
-    if isinstance(source, trimesh.Trimesh):
-        mesh = source.copy()
-    else:
-        try:
-            mesh = trimesh.load(source, force="mesh")
-        except Exception as error:
-            raise UserError(f"{name}: cannot be read as a triangle mesh ({error})") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise UserError(f"{name}: holds no triangles")
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    try:
+        if isinstance(source, trimesh.Trimesh):
+            vertices, faces = check_triangles(np.asarray(source.vertices, float),
+                                              np.asarray(source.faces, np.int64))
+        else:
+            vertices, faces = read_triangles(source)
+    except ValueError as error:
+        raise UserError(f"{name}: {error}; mend it or export it again") from error
+    if to_world is not None:
+        matrix = np.linalg.inv(np.asarray(to_world, float))
+        vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        if np.linalg.det(matrix[:3, :3]) < 0:
+            faces = faces[:, ::-1]
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=_DECIMALS)
     mesh.update_faces(mesh.nondegenerate_faces())
-    mesh = without_pinches(mesh)
-    if mesh.is_watertight and mesh.volume < 0:
-        mesh.invert()
-    return mesh
+    mesh.update_faces(np.unique(np.sort(mesh.faces, axis=1), axis=0, return_index=True)[1])
+    if len(mesh.faces) == 0:
+        raise UserError(f"{name}: holds no triangles with an area")
+    return oriented(without_pinches(mesh))
 
 
 def without_pinches(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

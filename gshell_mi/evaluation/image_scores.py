@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 from skimage.metrics import structural_similarity
 
 from ..compat import colour_science
 from ..errors import UserError
+from ..float_images import image_size
 from ..images import over_white, psnr
 from ..targets import load_target
 
@@ -37,7 +37,7 @@ def read_image(path: Path) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"Image '{path}' does not exist; check the path.")
     try:
-        size = mi.Bitmap(str(path)).size()
+        size = image_size(path)
     except Exception as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UserError(f"Image '{path}' cannot be read ({reason}); write it again as OpenEXR.") from error

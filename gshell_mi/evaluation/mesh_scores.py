@@ -9,6 +9,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from ..errors import UserError
+from ..mesh_files import read_triangles
 from ..topology import topology
 
 _WINDING_SAMPLES = 5_000
@@ -23,17 +24,14 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     """A mesh file that trimesh reads, welded by position.
 
     Raises:
-        UserError: the file is missing or holds no triangles.
+        UserError: the file is missing, holds no triangles with an area, or is damaged.
     """
     if not Path(path).is_file():
         raise UserError(f"Mesh '{path}' does not exist; check the path.")
     try:
-        loaded = trimesh.load(path, process=False, force="mesh")
-        mesh = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
-    except Exception as error:
-        raise UserError(f"Mesh '{path}' cannot be read ({error}); give a PLY, OBJ, GLB or STL.") from error
-    if len(mesh.faces) == 0:
-        raise UserError(f"Mesh '{path}' holds no triangles.")
+        mesh = trimesh.Trimesh(*read_triangles(path), process=False)
+    except ValueError as error:
+        raise UserError(f"Mesh '{path}' {error}; give a PLY, OBJ, GLB or STL.") from error
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh
 

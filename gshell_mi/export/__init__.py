@@ -1,6 +1,6 @@
 """What a fit leaves behind, in formats that other programs read."""
 
 from .fit_folder import export_fit, write_metrics
-from .output_folder import check_output_folder, make_output_folder
+from .output_folder import FitFolder, can_resume
 
-__all__ = ["check_output_folder", "export_fit", "make_output_folder", "write_metrics"]
+__all__ = ["FitFolder", "can_resume", "export_fit", "write_metrics"]

@@ -6,18 +6,24 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import trimesh
 from PIL import Image
 
 from ..errors import UserError
+from ..files import replacing
+from ..own_folder import own_folder
+from ..scene_files import load_scene
 from .atlas import unwrap
 from .bake import Textures, bake, project, vertex_tangents
 from .gltf import Part, write_glb
 from .ply import FittedMesh, read_ply, write_ply
 from .remesh import edge_length_for, remesh, triangle_quality
 from .stock_scene import up_axis
+
+#: What ``AssetConfig.obj`` adds.
+_OBJ_FILES = ("mesh.obj", "mesh.mtl", "mesh_base_color.png", "mesh_roughness.png", "mesh_metallic.png",
+              "mesh_normal.png")
 
 
 @dataclass(frozen=True)
@@ -60,12 +66,25 @@ def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
         ``remeshed_faces`` and ``remeshed_min_quality``.
 
     Raises:
-        UserError: the folder holds no fit, its mesh is empty, or remeshing failed.
+        UserError: the folder holds no fit, its mesh is empty, remeshing failed, or a file is in the way that
+            no run of ours wrote.
     """
     config = config or AssetConfig()
     fine = read_ply(folder / "mesh.ply")
     if len(fine.faces) == 0:
         raise UserError(f"'{folder / 'mesh.ply'}' is empty; there is nothing to export.")
+    lacking = [name for name in ("color", "roughness", "metallic") if name not in fine.attributes]
+    if lacking:
+        raise UserError(f"'{folder / 'mesh.ply'}' has no {lacking[0]}; run the fit again, which writes it.")
+    names = ["mesh.glb", *(_OBJ_FILES if config.obj else ())]
+    if config.remesh is not None:
+        names.append("remeshed.ply")
+    with own_folder(folder, "fit") as own:
+        own.claim(*names)
+        return _write(folder, fine, config)
+
+
+def _write(folder: Path, fine: FittedMesh, config: AssetConfig) -> dict:
     turn = y_up_turn(folder)
     fine = FittedMesh(fine.vertices @ turn.T, fine.faces, fine.normals @ turn.T, fine.attributes)
     vertices, faces = _simplified(fine, config.face_count)
@@ -90,7 +109,8 @@ def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
                 "roughnessFactor": float(np.clip(roughness.mean(), 0, 1)),
                 "metallicFactor": float(np.clip(metallic.mean(), 0, 1))}})])
         if config.obj:
-            trimesh.Trimesh(vertices, faces, process=False).export(folder / "mesh.obj")
+            with replacing(folder / "mesh.obj") as partial:
+                trimesh.Trimesh(vertices, faces, process=False).export(partial)
     if config.remesh is not None:
         report |= _write_remeshed(folder, read_ply(folder / "mesh.ply"), config)
     return report
@@ -137,10 +157,12 @@ def _write_obj(folder: Path, vertices: np.ndarray, normals: np.ndarray, faces: n
     images = {"base_color": textures.base_color, "roughness": orm[..., 1], "metallic": orm[..., 2],
               "normal": textures.normal}
     for name, image in images.items():
-        Image.fromarray(image).save(folder / f"mesh_{name}.png")
-    (folder / "mesh.mtl").write_text(
-        "newmtl subject\nKd 1 1 1\nillum 2\nmap_Kd mesh_base_color.png\nmap_Pr mesh_roughness.png\n"
-        "map_Pm mesh_metallic.png\nnorm mesh_normal.png\n")
+        with replacing(folder / f"mesh_{name}.png") as partial:
+            Image.fromarray(image).save(partial)
+    with replacing(folder / "mesh.mtl") as partial:
+        partial.write_text(
+            "newmtl subject\nKd 1 1 1\nillum 2\nmap_Kd mesh_base_color.png\nmap_Pr mesh_roughness.png\n"
+            "map_Pm mesh_metallic.png\nnorm mesh_normal.png\n", encoding="utf-8")
     # Welded: one position per point, or simulators would tear the object along the atlas's seams.
     welded, index = np.unique(vertices, axis=0, return_inverse=True)
     index = index.ravel()
@@ -150,7 +172,8 @@ def _write_obj(folder: Path, vertices: np.ndarray, normals: np.ndarray, faces: n
     lines += [f"vn {x:.5g} {y:.5g} {z:.5g}" for x, y, z in normals.tolist()]
     corners = np.stack([index[faces], faces, faces], axis=-1) + 1
     lines += ["f " + " ".join(f"{p}/{t}/{n}" for p, t, n in face) for face in corners.tolist()]
-    (folder / "mesh.obj").write_text("\n".join(lines) + "\n")
+    with replacing(folder / "mesh.obj") as partial:
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -163,7 +186,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def y_up_turn(folder: Path) -> np.ndarray:
     """The rotation (3, 3) from the scene of the fit in ``folder`` to glTF's axes, y up; ``v @ turn.T``."""
     scene = folder / "scene.xml"
-    return _to_y_up(up_axis(mi.load_file(str(scene)).sensors()) if scene.is_file() else 1)
+    return _to_y_up(up_axis(load_scene(scene).sensors()) if scene.is_file() else 1)
 
 
 def _to_y_up(axis: int) -> np.ndarray:

@@ -48,8 +48,8 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, *, texture_size: int = 1024,
     """
     with tempfile.TemporaryDirectory() as folder:
         given, found = Path(folder) / "mesh.npz", Path(folder) / "atlas.npz"
-        np.savez(given, vertices=_smoothed(vertices, faces).astype(np.float32), faces=faces.astype(np.uint32),
-                 texture_size=texture_size, padding=padding)
+        np.savez(given, vertices=_with_unit_faces(_smoothed(vertices, faces), len(faces)),
+                 faces=faces.astype(np.uint32), texture_size=texture_size, padding=padding)
         command = [sys.executable, str(Path(__file__).with_name("_unwrap.py")), str(given), str(found)]
         try:
             subprocess.run(command, check=True, timeout=seconds, capture_output=True)
@@ -61,6 +61,14 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, *, texture_size: int = 1024,
     # What it could not unwrap it leaves at the origin or drops.
     same_faces = atlas.faces.shape == faces.shape and (atlas.source[atlas.faces] == faces).all()
     return atlas if same_faces and np.isfinite(atlas.uv).all() else None
+
+
+def _with_unit_faces(vertices: np.ndarray, count: int) -> np.ndarray:
+    """The positions around the origin, scaled to faces with areas of about 1, whatever the units:
+    xatlas takes faces of less than 1e-7 for empty."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    scale = np.sqrt(count) / max((high - low).max(), 1e-30)
+    return ((vertices - (low + high) / 2) * scale).astype(np.float32)
 
 
 def _smoothed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -15,6 +15,8 @@ import trimesh
 
 from ..files import replacing
 from ..images import over_white, psnr, triptych, write_png
+from ..own_folder import OwnFolder
+from ..scene_files import load_scene
 from ..topology import topology
 from ..triangles import unit
 from .ply import write_ply
@@ -44,6 +46,9 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
     Returns:
         The metrics, which ``write_metrics`` stores.
     """
+    shown = np.unique(np.linspace(0, len(fit.sensors) - 1, views).round().astype(int))
+    OwnFolder(output, "fit").claim("mesh.ply", "template.ply", "light.exr", "scene.xml",
+                                   *(f"views/{fit.sensors[index].id()}.png" for index in shown))
     surface = fit.subject.surface
     attributes = {}
     for name, field in material.values().items():
@@ -55,7 +60,7 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
     write_light(output / "light.exr", fit.light, light)
     write_scene(output / "scene.xml", fit.light, fit.sensors)
-    scores = _write_views(output, fit, views)
+    scores = _write_views(output, fit, shown)
     vertices, faces, _ = surface.to_numpy()
     return {
         "scene": fit.path.name,
@@ -71,8 +76,9 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
 def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dict:
     """Writes ``metrics.json`` in one step, with the seconds per stage and their sum; returns its contents."""
     metrics = metrics | {"seconds": {**seconds, "total": round(sum(seconds.values()), 3)}}
+    OwnFolder(output, "fit").claim("metrics.json")
     with replacing(output / "metrics.json") as partial:
-        partial.write_text(json.dumps(metrics, indent=1))
+        partial.write_text(json.dumps(metrics, indent=1), encoding="utf-8")
     return metrics
 
 
@@ -92,14 +98,14 @@ def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.nd
     write_ply(path, vertices, faces, normals, attributes)
 
 
-def _write_views(output: Path, fit: FitScene, count: int) -> dict[str, float]:
-    """Renders the exported scene from ``count`` training views; writes triptychs, returns PSNR by view id."""
+def _write_views(output: Path, fit: FitScene, shown: np.ndarray) -> dict[str, float]:
+    """Renders the exported scene from the views ``shown``; writes triptychs, returns PSNR by view id."""
     folder = output / "views"
     folder.mkdir(exist_ok=True)
-    scene = mi.load_file(str(output / "scene.xml"))
+    scene = load_scene(output / "scene.xml")
     integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
     scores = {}
-    for index in np.unique(np.linspace(0, len(fit.sensors) - 1, count).round().astype(int)):
+    for index in shown:
         sensor, target = fit.sensors[index], fit.targets[index]
         image = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=_EXPORT_SPP))
         scores[sensor.id()] = psnr(over_white(image), over_white(target.rgba))

@@ -10,6 +10,7 @@ import trimesh
 
 from ..errors import UserError
 from ..files import replacing
+from ..mesh_files import check_triangles
 
 
 @dataclass(frozen=True)
@@ -54,24 +55,33 @@ def read_ply(path: Path) -> FittedMesh:
     """Reads what ``write_ply`` wrote.
 
     Raises:
-        UserError: the file is missing or no such mesh.
+        UserError: the file is missing or no such mesh, or values in it are not finite.
     """
     if not path.is_file():
         raise UserError(f"'{path}' does not exist; give the folder of a finished fit.")
     if b"\nelement face 0\n" in path.read_bytes()[:4096]:  # which trimesh takes for no mesh at all
         return FittedMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3)), {})
+    attributes = {}
     try:
         mesh = trimesh.load(path, process=False, force="mesh")
         table = mesh.metadata["_ply_raw"]["vertex"]["data"]
         columns = {name: np.ravel(table[name]) for name in table.dtype.names}
         stacked = {axes: np.stack([columns.pop(name) for name in names], axis=1) for axes, names in
                    (("p", ("x", "y", "z")), ("n", ("nx", "ny", "nz")))}
+        for name in sorted(columns):
+            stem, _, channel = name.rpartition("_")
+            attributes.setdefault(stem, []).append((int(channel), columns[name]))
+        _check(mesh, stacked, columns)
     except Exception as error:
-        raise UserError(f"'{path}' cannot be read as a fitted mesh ({error}); run the fit again.") from error
-    attributes = {}
-    for name in sorted(columns):
-        stem, _, channel = name.rpartition("_")
-        attributes.setdefault(stem, []).append((int(channel), columns[name]))
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+        raise UserError(f"'{path}' cannot be read as a fitted mesh ({reason}); run the fit again.") from error
     return FittedMesh(stacked["p"], np.asarray(mesh.faces, np.int64), stacked["n"], {
         name: channels[0][1] if len(channels) == 1 else np.stack([c for _, c in sorted(channels)], axis=1)
         for name, channels in attributes.items()})
+
+
+def _check(mesh: trimesh.Trimesh, stacked: dict[str, np.ndarray], columns: dict[str, np.ndarray]) -> None:
+    check_triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64))
+    for name, values in [("position", stacked["p"]), ("normal", stacked["n"]), *columns.items()]:
+        if not np.isfinite(values).all():
+            raise ValueError(f"its {name} is NaN or infinite somewhere")

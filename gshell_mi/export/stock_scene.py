@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
+from xml.sax.saxutils import quoteattr
 
 import mitsuba as mi
 import numpy as np
 
 from ..compat import environment_radiance, write_bitmap
+from ..errors import UserError
 from ..files import replacing
 from ..material import ATTRIBUTES
 
@@ -40,7 +42,7 @@ _SCENE = """\
 """
 
 _SENSOR = """\
-    <sensor type="{kind}" id="{id}">
+    <sensor type="{kind}" id={id}>
         <float name="fov" value="{fov}"/>
         <string name="fov_axis" value="x"/>
 {optics}
@@ -59,8 +61,8 @@ _SENSOR = """\
     </sensor>"""
 
 #: Parameters of the two kinds of sensors: those that traversal shows, by their names in XML.
-_OPTICS = {"perspective": ("principal_point_offset_x", "principal_point_offset_y"),
-           "thinlens": ("aperture_radius", "focus_distance")}
+_OPTICS = {"perspective": ("principal_point_offset_x", "principal_point_offset_y", "near_clip", "far_clip"),
+           "thinlens": ("aperture_radius", "focus_distance", "near_clip", "far_clip")}
 
 
 def write_light(path: Path, given: mi.Emitter, optimised: EnvironmentLight | None) -> None:
@@ -97,7 +99,7 @@ def write_scene(path: Path, light: mi.Emitter, sensors: list[mi.Sensor]) -> None
     text = _SCENE.format(depth=MAX_DEPTH, textures=textures, light_to_world=light_to_world,
                          sensors="\n".join(_sensor(sensor) for sensor in sensors))
     with replacing(path) as partial:
-        partial.write_text(text)
+        partial.write_text(text, encoding="utf-8")
 
 
 def up_axis(sensors: list[mi.Sensor]) -> int:
@@ -108,7 +110,13 @@ def up_axis(sensors: list[mi.Sensor]) -> int:
     >>> look = mi.ScalarTransform4f().look_at(origin=[0, -3, 1], target=[0, 0, 0], up=[0, 0, 1])
     >>> up_axis([mi.load_dict({"type": "perspective", "to_world": look})])
     2
+
+    Raises:
+        UserError: there is no sensor.
     """
+    if not sensors:
+        raise UserError("The scene of the fit has no sensors, so nothing says which way is up; run the fit "
+                        "again, or put its scene.xml back.")
     up = np.mean([np.array(mi.traverse(sensor)["to_world"].matrix).reshape(4, 4)[:3, 1]
                   for sensor in sensors], axis=0)
     return int(np.argmax(np.concatenate([up, -up])))
@@ -122,9 +130,10 @@ def _sensor(sensor: mi.Sensor) -> str:
     crop_x, crop_y = film.crop_offset()
     optics = "\n".join(f'        <float name="{name}" value="{float(np.ravel(parameters[name])[0]):.9g}"/>'
                        for name in _OPTICS[kind])
-    return _SENSOR.format(kind=kind, id=sensor.id(), fov=float(parameters["x_fov"][0]), optics=optics,
-                          to_world=_matrix(parameters["to_world"].matrix), width=width, height=height,
-                          crop_width=crop_width, crop_height=crop_height, crop_x=crop_x, crop_y=crop_y)
+    return _SENSOR.format(kind=kind, id=quoteattr(sensor.id()), fov=float(parameters["x_fov"][0]),
+                          optics=optics, to_world=_matrix(parameters["to_world"].matrix),
+                          width=width, height=height, crop_width=crop_width, crop_height=crop_height,
+                          crop_x=crop_x, crop_y=crop_y)
 
 
 def _matrix(matrix) -> str:

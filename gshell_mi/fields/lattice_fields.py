@@ -10,11 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from .. import memory
 from ..errors import UserError
-from ..lattice import BlockLattice, Lattice, lattice_of, make_lattice
+from ..lattice import BlockLattice, Lattice, block_count, lattice_of, make_lattice
 
 #: Steps that find the point an offset has brought somewhere; the error halves with each, or better.
 _FIXED_POINT_STEPS = 4
+#: What a file may hold; the first four are values, the rest say where they belong.
+_ARRAYS = ("sdf", "msdf", "deform", "weights", "blocks", "block_resolution")
+#: Cells per side in a file; beyond, vertices could not be numbered.
+_MOST_CELLS = 800
 
 
 @dataclass(frozen=True)
@@ -147,18 +152,13 @@ class LatticeFields:
                 out where there are none.
 
         Raises:
-            UserError: the file cannot be read, has no ``sdf`` or arrays that do not fit together.
+            UserError: the file cannot be read, has no ``sdf``, values that are not finite, or arrays that do
+                not fit together or into memory.
         """
-        try:
-            with np.load(path) as archive:
-                arrays = {k: np.asarray(archive[k], np.float32).ravel() for k in archive.files}
-        except Exception as error:
-            raise UserError(f"{path}: cannot be read as an .npz archive of fields ({error})") from error
-        if "sdf" not in arrays:
-            raise UserError(f"{path}: holds no array 'sdf' (it has {', '.join(arrays) or 'none'})")
-        sdf, blocks = arrays["sdf"], None
+        arrays = _arrays_of(path)
+        sdf, blocks, block_resolution = arrays["sdf"], None, 0
         if "blocks" in arrays:
-            blocks = arrays["blocks"].astype(np.uint32)
+            blocks, block_resolution = _checked_blocks(arrays, grid, path)
         else:
             try:
                 lattice_of(grid, sdf.size)
@@ -166,7 +166,7 @@ class LatticeFields:
                 raise UserError(f"{path}: sdf does not fit: {error}") from None
         closed = cls.closed(sdf, grid)
         fields = cls(sdf, arrays.get("msdf", closed.msdf), arrays.get("deform", closed.deform), grid,
-                     blocks=blocks, block_resolution=int(arrays.get("block_resolution", [0])[0]))
+                     blocks=blocks, block_resolution=block_resolution)
         if "weights" in arrays and fields.lattice.weight_count:
             fields = replace(fields, weights=arrays["weights"])
         sizes = {"msdf": sdf.size, "deform": 3 * sdf.size, "weights": fields.lattice.weight_count}
@@ -175,6 +175,40 @@ class LatticeFields:
             if size != needed:
                 raise UserError(f"{path}: {name} has {size} values, but sdf needs {needed} of them")
         return fields
+
+
+def _arrays_of(path: str | Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path) as archive:
+            names = [name for name in _ARRAYS if name in archive.files]
+            unpacked = sum(entry.file_size for entry in archive.zip.infolist()
+                           if entry.filename.removesuffix(".npy") in names)
+            memory.require(2 * unpacked, memory.free_memory(), f"The archive {path}", "give another")
+            arrays = {name: archive[name].ravel().astype(np.float32 if name in _ARRAYS[:4] else np.float64)
+                      for name in names}
+            found = ", ".join(archive.files) or "none"
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"{path}: cannot be read as an .npz archive of fields ({error})") from error
+    if "sdf" not in arrays:
+        raise UserError(f"{path}: holds no array 'sdf' (it has {found})")
+    for name, values in arrays.items():
+        if not np.isfinite(values).all():
+            raise UserError(f"{path}: {name} holds NaN or infinity; write finite values")
+    return arrays
+
+
+def _checked_blocks(arrays: dict[str, np.ndarray], grid: str, path: str | Path) -> tuple[np.ndarray, int]:
+    """The numbers of blocks and the cells per side of their lattice, for which nothing else may pass."""
+    blocks, resolution = arrays["blocks"], arrays.get("block_resolution", np.zeros(1))
+    if resolution.size != 1 or resolution[0] not in range(1, _MOST_CELLS + 1):
+        raise UserError(f"{path}: has blocks, but no block_resolution from 1 to {_MOST_CELLS}")
+    count = block_count(make_lattice(grid, int(resolution[0])))
+    if len(blocks) == 0 or (np.diff(blocks) <= 0).any() or (blocks % 1).any() or blocks[0] < 0 or (
+            blocks[-1] >= count):
+        raise UserError(f"{path}: its blocks are not ascending whole numbers below {count}")
+    return blocks.astype(np.uint32), int(resolution[0])
 
 
 def closed_at_border(sdf: np.ndarray, lattice: Lattice) -> np.ndarray:

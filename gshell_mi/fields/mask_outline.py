@@ -46,7 +46,9 @@ def mask_distance(alpha: np.ndarray, *, fill_holes: bool = True, thin_parts: boo
     if not inside.any():
         return np.full(alpha.shape, np.inf)
     # The frame's border is no outline: what it cuts off may go on outside.
-    contours = find_contours(alpha, 0.5)
+    # A film of one row or column is taken for two alike, as there are no cells between its pixels else.
+    rows, columns = (int(side < 2) for side in alpha.shape)
+    contours = find_contours(np.pad(alpha, ((0, rows), (0, columns)), mode="edge"), 0.5)
     if not contours:
         return np.full(alpha.shape, -np.inf)
     steps = np.linspace(0.0, 1.0, _CONTOUR_SAMPLES, endpoint=False)[:, None, None]

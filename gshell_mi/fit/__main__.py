@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from ..command_line import run_command
+from ..export import can_resume
 from ..wording import counted
 from .config import FitConfig, default_output
 
@@ -29,7 +30,8 @@ class _Arguments:
     resume: bool = False
     """Continue an interrupted fit in the output folder."""
     overwrite: bool = False
-    """Replace an earlier fit in the output folder."""
+    """Replace an earlier fit in the output folder, once the new one is complete; other files are left
+    alone."""
     preview: bool = False
     """A rough result in half a minute: a coarser lattice, fewer steps and samples, no refinement, no mesh.glb
     or report.html. What else is given on the command line still counts."""
@@ -77,6 +79,8 @@ def _fit(given: _Arguments) -> None:
 
 def _how_to_continue(given: _Arguments) -> str:
     output = given.output or default_output(given.scene)
+    if not can_resume(output):
+        return "Interrupted before the first checkpoint; start it again."
     return f"Interrupted; continue with --resume (the last checkpoint is in '{output}')."
 
 

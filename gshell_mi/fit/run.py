@@ -13,23 +13,25 @@ import numpy as np
 import trimesh
 
 from ..errors import UserError
-from ..export import check_output_folder, export_fit, make_output_folder, write_metrics
+from ..export import FitFolder, export_fit, write_metrics
 from ..export.asset import write_asset
 from ..fields import LatticeFields
 from ..fields.interpolation import Interpolation
 from ..fields.lattice_fields import closed_at_border
 from ..fields.thin_parts import thickened, thin_part_refinement
 from ..fields.visual_hull import visual_hull
+from ..interrupt import Interrupt
 from ..lattice import CubeLattice, Lattice, make_lattice
 from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..report import write_report
 from ..scene import load_fit_scene
+from ..scene_inputs import scene_inputs
 from ..topology import topology
 from ..triangles import positive_part
 from ..views import PinholeViews
 from .bookkeeping.bookkeeping import Bookkeeping, checkpoint_path
 from .bookkeeping.checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
-from .bookkeeping.interrupt import Interrupt
+from .bookkeeping.fingerprint import check_fingerprint, fingerprint
 from .bookkeeping.observer import Observer
 from .bookkeeping.progress import Progress
 from .carving.carving import carve
@@ -112,16 +114,19 @@ def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: s
     config = config or FitConfig()
     scene = Path(scene)
     output = Path(output) if output else default_output(scene)
-    with Interrupt() as interrupt, Progress(quiet=quiet) as progress:
-        return _Fit(scene, output, targets, config, resume, overwrite, report, progress, interrupt,
-                    observer).run()
+    with (Interrupt() as interrupt, Progress(quiet=quiet) as progress,
+          FitFolder(output, resume=resume, overwrite=overwrite) as folder):
+        fit = _Fit(scene, folder, targets, config, resume, report, progress, interrupt, observer)
+        metrics = fit.run()
+        return FitResult(output, metrics)
 
 
 class _Fit:
-    def __init__(self, scene: Path, output: Path, targets: str | Path | None, config: FitConfig, resume: bool,
-                 overwrite: bool, report: bool, progress: Progress, interrupt: Interrupt,
+    def __init__(self, scene: Path, folder: FitFolder, targets: str | Path | None, config: FitConfig,
+                 resume: bool, report: bool, progress: Progress, interrupt: Interrupt,
                  observer: Observer | None):
-        self.config, self.output, self.report = config, output, report
+        self.config, self.folder, self.report = config, folder, report
+        self.output = output = folder.place
         self.progress, self.interrupt = progress, interrupt
         self.checkpoint = Checkpoint("hull", 0, _plain(config))
         if resume:
@@ -129,16 +134,20 @@ class _Fit:
             _same_config(self.checkpoint.config, _plain(config))
         self.books = Bookkeeping(output, self.checkpoint, config.checkpoint_seconds, progress, interrupt,
                                  observer)
-        check_output_folder(output, keep=resume, overwrite=overwrite)
         with progress.stage("targets", None):
             self.scene = load_fit_scene(scene, Path(targets) if targets else None,
                                         before_targets=self._check_memory, on_reference=progress.reference)
             self.views = PinholeViews.from_sensors(self.scene.sensors)
             check_given(self.scene, config)
             check_depth(self.scene, self.views)
+            self.last_lattice = last = fit_lattice(self.scene.subject, config)
+            found = fingerprint(self.scene, last)
+            if resume:
+                check_fingerprint(self.checkpoint.inputs, found)
+            self.checkpoint.inputs = found
+            folder.check(scene_inputs(scene) | self.scene.target_files, self.views.ids)
         if not all(target.has_alpha for target in self.scene.targets):
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
-        self.last_lattice = last = fit_lattice(self.scene.subject, config)
         # Given fields may have detail that no coarser lattice holds.
         coarse = last.resolution if self.scene.subject.filename else config.start_resolution
         self.lattice = make_lattice(EARLY_GRIDS[last.grid], min(last.resolution, coarse))
@@ -148,12 +157,13 @@ class _Fit:
         steps = config.iterations and config.detail_iterations and config.field == "explicit"
         self.joint_lattice = self.late_lattice if steps else last
         self.pixels = PixelPool(self.views, self.scene.targets)
-        # Nothing of an earlier fit goes before all is known to be in order.
-        make_output_folder(output, keep=resume)
+        # Nothing is written before all is known to be in order.
+        folder.prepare()
         if observer:
             observer.begin(self.scene)
 
-    def run(self) -> FitResult:
+    def run(self) -> dict:
+        """Returns the metrics."""
         try:
             if self.checkpoint.stage == "hull":
                 self._hull()
@@ -177,11 +187,12 @@ class _Fit:
             if self.report:
                 self._write_documents()
                 metrics = self._write_metrics(metrics)
+            self.folder.finish()
         except OSError as error:
             raise UserError(f"'{error.filename or self.output}' cannot be written "
                             f"({error.strerror or error}); free some space or mend its permissions, then "
                             f"continue with --resume.") from error
-        return FitResult(self.output, metrics)
+        return metrics
 
     def _check_memory(self, subject: mi.Shape, sensors: list[mi.Sensor]) -> None:
         """Says how much memory the fit needs, and refuses it if that much is not free."""

@@ -44,8 +44,14 @@ def check_given(scene: FitScene, config: FitConfig) -> None:
     """Whether the scene gives what the modes of the fit take from it.
 
     Raises:
-        UserError: the material is to be kept, but there is none; or the given fields hold no surface.
+        UserError: the material is to be kept, but there is none; the given fields hold no surface; or there
+            is a second emitter.
     """
+    others = [emitter.id() for emitter in scene.scene.emitters() if emitter.id() != "light"]
+    if others:
+        raise UserError(f"Scene '{scene.path}' has another emitter beside 'light' ('{others[0]}'); a fit "
+                        f"explains the images by one environment: take it out, and its light is found as "
+                        f"part of that.")
     if scene.subject.surface.is_empty:
         raise UserError(f"The fields '{scene.subject.filename}' of the gshell shape hold no surface; leave "
                         f"'filename' out of '{scene.path}' or give others.")

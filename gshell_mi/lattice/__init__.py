@@ -1,6 +1,6 @@
 """The lattices on which the fields live, whole or stored around a surface."""
 
-from .block_lattice import BlockLattice
+from .block_lattice import BlockLattice, block_count
 from .lattice import (
     GRIDS,
     MISSING,
@@ -16,4 +16,4 @@ from .lattice import (
 )
 
 __all__ = ["GRIDS", "MISSING", "BccLattice", "BlockLattice", "CubeLattice", "CubicGrid", "FlexiCubesLattice",
-           "Lattice", "TetLattice", "array_type", "lattice_of", "make_lattice"]
+           "Lattice", "TetLattice", "array_type", "block_count", "lattice_of", "make_lattice"]

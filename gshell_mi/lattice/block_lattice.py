@@ -89,7 +89,7 @@ class BlockLattice:
         """Per row, bit i: the lattice has a vertex next to its vertex i that is not stored."""
         dr.eval(self.upper, self.lower, self.edge)
 
-        stored = _Table(blocks, (across, ny, nz), _block_count(lattice))
+        stored = _Table(blocks, (across, ny, nz), block_count(lattice))
         before, here, after = stored.surrounded(column, y >> 2, z >> 2)
         self._lacking = dr.select(here, uint_t(0), 1)
         self._lacking |= dr.select(before, uint_t(0), 2) | dr.select(after, uint_t(0), 4)
@@ -182,7 +182,7 @@ class BlockLattice:
     @property
     def fraction(self) -> float:
         """Share of the lattice's blocks that are stored."""
-        return dr.width(self.blocks) / _block_count(self.lattice)
+        return dr.width(self.blocks) / block_count(self.lattice)
 
     def lattice_vertex(self, vertex: Any) -> Any:
         """Ids in the whole lattice; arbitrary for what fills up rows."""
@@ -337,7 +337,8 @@ def _block_counts(lattice: Lattice) -> tuple[int, int, int]:
     return tuple(-(-lattice.stride // side) for side in BLOCK)
 
 
-def _block_count(lattice: Lattice) -> int:
+def block_count(lattice: Lattice) -> int:
+    """How many blocks a whole lattice has."""
     nx, ny, nz = _block_counts(lattice)
     return nx * ny * nz
 
@@ -365,7 +366,7 @@ def _blocks_near(lattice: Lattice, cells: Any, others: Any = None) -> Any:
     """Ids of the blocks within ``MARGIN`` of cells, and of the ``others``."""
     uint_t = type(cells)
     counts = _block_counts(lattice)
-    near = dr.zeros(uint_t, _block_count(lattice))
+    near = dr.zeros(uint_t, block_count(lattice))
     nx, ny = dr.opaque(uint_t, counts[0]), dr.opaque(uint_t, counts[1])
     if dr.width(cells):
         stride = dr.opaque(uint_t, lattice.stride)

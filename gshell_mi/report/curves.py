@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,20 @@ _ROW, _CHARACTERS = 14, 70
 
 
 def curves(log: Path) -> list[str]:
-    """One SVG per quantity: the losses of each stage on a logarithmic axis, and PSNR. Empty without a log."""
+    """One SVG per quantity: the losses of each stage on a logarithmic axis, and PSNR. Empty without a log.
+
+    Lines that no fit wrote are left out, and names are escaped.
+    """
     if not log.is_file():
         return []
     stages: dict[str, dict[str, list[tuple[int, float]]]] = {}
-    for line in log.read_text().splitlines():
-        entry = json.loads(line)
+    for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
+        entry = _entry(line)
+        if entry is None:
+            continue
         stage = stages.setdefault(entry["stage"], {})
         for name, value in entry.items():
-            if name not in ("stage", "iteration", "seconds"):
+            if name not in ("stage", "iteration", "seconds") and _is_number(value):
                 stage.setdefault(name, []).append((entry["iteration"], value))
     drawings = []
     for stage, series in stages.items():
@@ -33,6 +39,21 @@ def curves(log: Path) -> list[str]:
         if "psnr" in series:
             drawings.append(_plot(f"{stage}: PSNR of the steps' pixels (dB)", {"psnr": series["psnr"]}))
     return drawings
+
+
+def _entry(line: str) -> dict | None:
+    """One step of the log; None if the line holds none."""
+    try:
+        entry = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(entry, dict) or not isinstance(entry.get("stage"), str):
+        return None
+    return entry if _is_number(entry.get("iteration")) else None
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic: bool = False) -> str:
@@ -51,8 +72,8 @@ def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic
     down = lambda y: _TOP + (y_high - y) / y_span * (_HEIGHT - _TOP - _BOTTOM)  # noqa: E731
     legend = _legend(list(points)) if len(points) > 1 else []
     height = _HEIGHT + _ROW * len(legend)
-    parts = [f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{title}">',
-             f'<text x="{_LEFT}" y="14" class="title">{title}</text>']
+    parts = [f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escape(title)}">',
+             f'<text x="{_LEFT}" y="14" class="title">{escape(title)}</text>']
     for y in np.linspace(y_low, y_high, 4):
         label = f"{10 ** y:.2g}" if logarithmic else f"{y:.3g}"
         parts.append(f'<path class="grid" d="M{_LEFT} {down(y):.1f}H{_WIDTH - _RIGHT}"/>'
@@ -62,7 +83,7 @@ def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic
     for number, (name, (x, y)) in enumerate(points.items()):
         color = _COLORS[number % len(_COLORS)]
         path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across(x), down(y), strict=True))
-        parts.append(f'<polyline points="{path}" stroke="{color}"><title>{name}</title></polyline>')
+        parts.append(f'<polyline points="{path}" stroke="{color}"><title>{escape(name)}</title></polyline>')
     return "".join([*parts, *legend, "</svg>"])
 
 
@@ -75,7 +96,7 @@ def _legend(names: list[str]) -> list[str]:
             rows.append([])
             used = 0
         color = _COLORS[number % len(_COLORS)]
-        rows[-1].append(f'<tspan dx="10" fill="{color}">{name.replace("_", " ")}</tspan>')
+        rows[-1].append(f'<tspan dx="10" fill="{color}">{escape(name.replace("_", " "))}</tspan>')
         used += len(name) + 2
     return [f'<text x="{_WIDTH / 2}" y="{_HEIGHT - 8 + _ROW * (row + 1)}" text-anchor="middle">'
             f'{"".join(tspans)}</text>' for row, tspans in enumerate(rows)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 import tempfile
 from dataclasses import dataclass
 from importlib.resources import files
@@ -16,13 +15,16 @@ import numpy as np
 from markupsafe import Markup
 from PIL import Image
 
+from ..environment_maps import read_environment_map
 from ..errors import UserError
 from ..export.asset import write_asset
 from ..files import replacing
 from ..images import srgb
+from ..own_folder import TAG, own_folder
 from ..turntable import TurntableConfig, render_turntable, write_video
 from ..wording import counted
 from .curves import curves
+from .metrics import read_metrics
 from .viewer_model import viewer_model
 
 _PROBE_HEIGHT = 160
@@ -50,11 +52,17 @@ def write_report(folder: Path, config: ReportConfig | None = None) -> Path:
     """Writes ``report.html`` of the fit in ``folder``; makes ``mesh.glb`` first if it is missing.
 
     Raises:
-        UserError: the folder holds no finished fit, or its mesh is empty.
+        UserError: the folder holds no finished fit, its mesh is empty, or a file is in the way that no run of
+            ours wrote.
     """
-    config = config or ReportConfig()
     folder = Path(folder)
-    metrics = _metrics(folder / "metrics.json")
+    metrics = read_metrics(folder / "metrics.json")
+    with own_folder(folder, "fit") as own:
+        own.claim("report.html")
+        return _write(folder, metrics, config or ReportConfig())
+
+
+def _write(folder: Path, metrics: dict, config: ReportConfig) -> Path:
     turntable = TurntableConfig(frames=config.turntable_frames, size=config.turntable_size,
                                 spp=config.turntable_spp, fps=12, max_depth=3, orange_back=True)
     frames = render_turntable(folder, turntable)
@@ -67,10 +75,10 @@ def write_report(folder: Path, config: ReportConfig | None = None) -> Path:
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
                                      lstrip_blocks=True)
     environment.filters["counted"] = counted
-    template = environment.from_string((page / "report.html.j2").read_text())
-    library = (page / "model-viewer.min.js").read_text().rpartition("//# sourceMappingURL")[0]
+    template = environment.from_string((page / "report.html.j2").read_text(encoding="utf-8"))
+    library = (page / "model-viewer.min.js").read_text(encoding="utf-8").rpartition("//# sourceMappingURL")[0]
     text = template.render(
-        name=Path(metrics["scene"]).stem, metrics=metrics, turntable=video_data,
+        name=Path(metrics["scene"]).stem, generator=TAG, metrics=metrics, turntable=video_data,
         model=_data_url("model/gltf-binary", viewer_model(folder)), library=Markup(library),
         triptychs=_triptychs(folder / "views", config.views, metrics),
         curves=[Markup(drawing) for drawing in curves(folder / "log.jsonl")],
@@ -80,20 +88,17 @@ def write_report(folder: Path, config: ReportConfig | None = None) -> Path:
     return folder / "report.html"
 
 
-def _metrics(path: Path) -> dict:
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"'{path}' is missing or no JSON; give the folder of a finished fit.") from error
-
-
 def _triptychs(folder: Path, count: int, metrics: dict) -> list[dict]:
     """Target, fit and error of up to ``count`` views, as data URLs."""
     paths = sorted(folder.glob("*.png"))
     chosen = np.unique(np.linspace(0, len(paths) - 1, count).round().astype(int)) if paths else []
     shown = []
     for path in (paths[i] for i in chosen):
-        pixels = np.asarray(Image.open(path).convert("RGB"))
+        try:
+            pixels = np.asarray(Image.open(path).convert("RGB"))
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            raise UserError(f"'{path}' cannot be read as an image; remove it, or run the fit "
+                            f"again.") from error
         width = pixels.shape[1] // 3
         target, fit, error = (_image_url(pixels[:, i * width:(i + 1) * width]) for i in range(3))
         shown.append({"name": path.stem, "target": target, "fit": fit, "error": error,
@@ -103,9 +108,8 @@ def _triptychs(folder: Path, count: int, metrics: dict) -> list[dict]:
 
 def _probe(path: Path) -> np.ndarray:
     """The light: its map, and a mirror ball and a grey ball in it, exposed alike; 8-bit."""
-    light = mi.load_dict({"type": "envmap", "filename": str(path)})
-    bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
-    radiance = np.array(bitmap)
+    radiance = read_environment_map(path, "Light")
+    light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(radiance)})
     size = _PROBE_HEIGHT
     sensor = {"type": "perspective", "fov": 30,
               "to_world": mi.ScalarTransform4f().look_at([0, 0.6, 4], [0, 0, 0], [0, 1, 0]),

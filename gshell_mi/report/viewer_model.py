@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import UserError
 from ..export.asset import y_up_turn
 from ..export.gltf import Part, glb_bytes, read_part
 from ..export.ply import read_ply
+from ..mesh_files import check_triangles
 from ..topology import mesh_edges
 from ..triangles import unit
 from ..turntable.looks import ORANGE
@@ -23,9 +25,11 @@ def viewer_model(folder: Path) -> bytes:
     """``mesh.glb`` with its back faces in orange, the template and the boundary loops as further materials.
 
     ``back faces``, ``template`` and ``boundary loops`` name the materials; the template starts invisible.
+
+    Raises:
+        UserError: a file of the fit is missing or damaged.
     """
-    base = (folder / "mesh.glb").read_bytes()
-    subject = read_part(base)
+    base, subject = _subject(folder / "mesh.glb")
     turn = y_up_turn(folder)
     mesh, template = read_ply(folder / "mesh.ply"), read_ply(folder / "template.ply")
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
@@ -43,6 +47,20 @@ def viewer_model(folder: Path) -> bytes:
                                                     "roughnessFactor": 1}, "emissiveFactor": [0.5, 0, 0.2],
                            "alphaMode": "MASK", "doubleSided": True}))
     return glb_bytes(parts, base)
+
+
+def _subject(path: Path) -> tuple[bytes, Part]:
+    try:
+        base = path.read_bytes()
+        subject = read_part(base)
+        faces, normals = subject.indices, subject.attributes["NORMAL"]
+        check_triangles(subject.attributes["POSITION"], faces.astype(np.int64))
+        if normals.shape != subject.attributes["POSITION"].shape:
+            raise ValueError("its normals are not as many as its vertices")
+        return base, subject
+    except Exception as error:    # anything may be where a number should be
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+        raise UserError(f"'{path}' is damaged ({reason}); delete it and make the report again.") from error
 
 
 def back_faces(positions: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> Part:

@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..command_line import run_command
-from .turntable import TurntableConfig, render_turntable, write_video
+from .turntable import TurntableConfig, render_turntable
+from .video import write_video
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,8 @@ class _Arguments:
     folder: tyro.conf.Positional[Path]
     """Folder of a finished fit."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """The MP4; the GIF of the same name comes beside it. Default: turntable.mp4 in the fit's folder."""
+    """The MP4; the GIF of the same name comes beside it. Earlier ones of this command are replaced. Default:
+    turntable.mp4 in the fit's folder."""
     envmap: Path | None = None
     """Environment map (EXR, latitude-longitude) to light the object with instead of the fitted light."""
     variant: str = "llvm_ad_rgb"

@@ -1,15 +1,13 @@
-"""Once around an object: frames, MP4 and GIF."""
+"""Once around an object, frame by frame."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import imageio_ffmpeg
 import mitsuba as mi
 import numpy as np
-from PIL import Image
 
 from ..errors import UserError
 from ..export.fitted_scene import load_fitted_scene
@@ -106,38 +104,8 @@ def orbit(vertices: np.ndarray, axis: int, count: int, elevation: float, size: i
         origin = center + distance * toward
         yield mi.load_dict({
             "type": "perspective", "fov": _FOV,
+            # Mitsuba's own would be 0.01 and 10 000, whatever the object's units.
+            "near_clip": 1e-3 * float(distance), "far_clip": 1e3 * float(distance),
             "to_world": mi.ScalarTransform4f().look_at(list(origin), list(center), list(up)),
             "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba",
                      "rfilter": {"type": "box"}}})
-
-
-def write_video(frames: Iterable[np.ndarray], path: Path, fps: float, *, gif: bool = True) -> list[Path]:
-    """Writes frames (h, w, 3) in [0, 1] as MP4 (H.264) and, beside it, as an endless GIF; returns the files.
-
-    Raises:
-        UserError: the files cannot be written.
-    """
-    path = Path(path).with_suffix(".mp4")
-    pictures, writer = [], None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for frame in frames:
-            pixels = np.ascontiguousarray((np.clip(frame, 0, 1) * 255 + 0.5).astype(np.uint8))
-            if writer is None:
-                writer = imageio_ffmpeg.write_frames(
-                    str(path), pixels.shape[1::-1], fps=fps, quality=None, macro_block_size=2,
-                    output_params=["-crf", "20", "-movflags", "+faststart"])
-                writer.send(None)
-            writer.send(pixels)
-            if gif:
-                pictures.append(Image.fromarray(pixels).quantize(128))
-        writer.close()
-        if not gif:
-            return [path]
-        animation = path.with_suffix(".gif")
-        pictures[0].save(animation, save_all=True, append_images=pictures[1:], loop=0,
-                         duration=max(20, round(1000 / fps)))
-    except OSError as error:
-        raise UserError(f"'{path}' cannot be written ({error.strerror or error}); choose another file with "
-                        f"-o.") from error
-    return [path, animation]

@@ -14,6 +14,7 @@ from ..errors import UserError
 from ..export.gltf import glb_bytes
 from ..images import over_white
 from ..views import PinholeViews
+from .own_origin import free_port, guarded_server
 from .parts import mesh_parts, template_part
 
 if TYPE_CHECKING:
@@ -40,13 +41,13 @@ class Viewer:
     """A page that shows a fit's mesh, its template, its cameras and its losses while it runs.
 
     It is an ``Observer`` of ``fit_scene``. The page belongs to this machine alone: only browsers on it (or
-    behind ``ssh -L 8080:localhost:8080``) can open it.
+    behind ``ssh -L 8080:localhost:8080``) can open it, and pages of other sites cannot read it.
 
     Args:
         port: of the server; if it is taken, the next one that is free.
 
     Raises:
-        UserError: viser is not installed.
+        UserError: viser is not installed, or ``port`` is none.
 
     ::
 
@@ -61,7 +62,8 @@ class Viewer:
         except ImportError as error:
             raise UserError("The live view needs viser, which is not installed; run 'pip install "
                             "gshell_mi[viewer]' or leave out --viewer.") from error
-        with _quiet():
+        port = free_port(port)
+        with _quiet(), guarded_server():
             self._server = viser.ViserServer(host="127.0.0.1", port=port, label="gshell_mi", verbose=False)
         self._stage, self._due = "", 0.0
         self._losses: list[float] = []

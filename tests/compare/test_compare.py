@@ -1,6 +1,7 @@
 """The compare command: fits, folders, files and meshes; and every mistake in one sentence."""
 
 import json
+import shutil
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -10,6 +11,7 @@ from fitted import RADIUS, open_sphere, write_fit
 from PIL import Image
 
 from gshell_mi.compare.__main__ import main
+from gshell_mi.export.ply import read_ply, write_ply
 
 VIEWS, SIZE = 2, 32
 
@@ -95,6 +97,8 @@ def test_other_sensors(sphere, tmp_path):
     (("{targets}/view_000.exr", "{fit}/scene.xml"), "cannot be read"),
     (("{targets}/view_000.exr", "{fit}/light.exr"), "only images of one size"),
     (("{targets}", "{dim}", "--json", "{none}/a/b.json"), "cannot be written"),
+    (("{targets}", "{dim}", "--json", "/dev/full/a"), "'/dev/full/a' cannot be written"),
+    (("{targets}/view_000.exr", "{dim}/view_000.exr", "--json", "{dim}/view_000.exr"), "is compared, and"),
 ])
 def test_mistakes(sphere, tmp_path, capsys, arguments, message):
     (tmp_path / "empty").mkdir()
@@ -115,3 +119,30 @@ def test_fit_that_does_not_know_its_targets(sphere, tmp_path, capsys):
 
 def test_sphere_is_what_it_claims():
     assert np.linalg.norm(open_sphere(3).vertices, axis=1) == pytest.approx(RADIUS)
+
+
+def test_images_without_a_partner_are_named(sphere, tmp_path, capsys):
+    """And a suffix in another case is no other name."""
+    ours, theirs = (shutil.copytree(sphere.targets, tmp_path / name) for name in ("ours", "theirs"))
+    (ours / "view_001.exr").unlink()
+    (theirs / "view_000.exr").rename(theirs / "view_000.EXR")
+    found = scores(ours, theirs, tmp_path=tmp_path)
+    assert list(found["views"]) == ["view_000"]
+    assert found["unmatched"] == [str(theirs / "view_001.exr")]
+    assert "1 image without a partner of the same name not compared" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["[", "[" * 100_000, "5", '{"targets": 5}', '{"targets": null}', "\ud800"])
+def test_metrics_that_do_not_tell_the_targets(text, sphere, tmp_path, capsys):
+    folder = shutil.copytree(sphere.folder, tmp_path / "fit")
+    (folder / "metrics.json").write_bytes(text.encode(errors="surrogatepass"))
+    assert main([str(folder)]) == 2
+    assert "does not tell where the targets are" in capsys.readouterr().err
+
+
+def test_meshes_that_are_damaged(sphere, tmp_path, capsys):
+    mesh = read_ply(sphere.folder / "mesh.ply")
+    for spoilt in (mesh.faces + 10**6, mesh.faces * 0):
+        write_ply(tmp_path / "a.ply", mesh.vertices, spoilt, mesh.normals, mesh.attributes)
+        assert main([str(tmp_path / "a.ply"), str(sphere.folder / "mesh.ply")]) == 2
+        assert capsys.readouterr().err.startswith(f"error: Mesh '{tmp_path / 'a.ply'}' ")

@@ -2,6 +2,7 @@
 
 import json
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -12,7 +13,7 @@ from PIL import Image
 from topology import loop_count
 
 from gshell_mi import UserError
-from gshell_mi.export import check_output_folder, export_fit, make_output_folder, write_metrics
+from gshell_mi.export import export_fit, write_metrics
 from gshell_mi.export.ply import read_ply, write_ply
 from gshell_mi.export.stock_scene import up_axis, write_light, write_scene
 from gshell_mi.fields import LatticeFields, sphere
@@ -21,6 +22,7 @@ from gshell_mi.fit.joint.joint import JointStage
 from gshell_mi.lattice import TetLattice
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField
+from gshell_mi.own_folder import MARK, OwnFolder
 from gshell_mi.scene import load_fit_scene
 
 LATTICE = TetLattice(16)
@@ -99,10 +101,15 @@ def test_light(exported):
 
 def test_light_on_a_full_disk(exported, tmp_path):
     """Mitsuba's own error becomes the one that a fit turns into a sentence."""
+    resource = pytest.importorskip("resource")
     (tmp_path / "light.exr").write_bytes(b"precious")
-    (tmp_path / ".partial.light.exr").symlink_to("/dev/full")
-    with pytest.raises(OSError, match="No space left on device"):
-        write_light(tmp_path / "light.exr", exported.fit.light, EnvironmentLight(exported.radiance))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_light(tmp_path / "light.exr", exported.fit.light, EnvironmentLight(exported.radiance))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert [path.name for path in tmp_path.iterdir()] == ["light.exr"]
     assert (tmp_path / "light.exr").read_bytes() == b"precious"
 
@@ -141,12 +148,14 @@ def test_any_perspective_sensor_survives(exported, tmp_path, kind, crop):
     if crop:
         film |= {"crop_width": 20, "crop_height": 12, "crop_offset_x": 30, "crop_offset_y": 9}
     to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0.1, 0, 0], [0, 1, 0])
-    sensor = mi.load_dict(SENSORS[kind] | {"to_world": to_world, "film": film, "id": "view_007"})
+    sensor = mi.load_dict(SENSORS[kind] | {"to_world": to_world, "film": film, "id": 'view "7" & <8>',
+                                           "near_clip": 2e-6, "far_clip": 3e7})
     for name in ("mesh.ply", "light.exr"):
         (tmp_path / name).write_bytes((exported.output / name).read_bytes())
     write_scene(tmp_path / "scene.xml", exported.fit.light, [sensor])
     (written,) = mi.load_file(str(tmp_path / "scene.xml")).sensors()
-    assert written.id() == "view_007"
+    assert written.id() == 'view "7" & <8>'
+    assert (written.near_clip(), written.far_clip()) == pytest.approx((2e-6, 3e7))
     assert tuple(written.film().crop_size()) == tuple(sensor.film().crop_size())
     at = mi.Point2f(np.random.default_rng(3).random((2, 50)).astype(np.float32))
     ours, theirs = (s.sample_ray(0, 0.5, at, mi.Point2f(0.1, 0.8))[0] for s in (written, sensor))
@@ -181,6 +190,31 @@ def test_light_survives(exported, tmp_path, light, optimised):
     (tmp_path / "mesh.ply").write_bytes((exported.output / "mesh.ply").read_bytes())
     written = mi.load_file(str(tmp_path / "scene.xml")).environment()
     np.testing.assert_allclose(look(written), look(emitter), rtol=2e-3)
+
+
+def test_ids_are_escaped(exported, tmp_path):
+    """An id may hold what XML uses itself."""
+    name = """<a & "b" 'c'>"""
+    sensor = mi.load_dict({"type": "perspective", "id": name})
+    for file in ("mesh.ply", "light.exr"):
+        (tmp_path / file).write_bytes((exported.output / file).read_bytes())
+    write_scene(tmp_path / "scene.xml", exported.fit.light, [sensor])
+    assert ElementTree.parse(tmp_path / "scene.xml").find("sensor").get("id") == name
+    assert mi.load_file(str(tmp_path / "scene.xml")).sensors()[0].id() == name
+
+
+def test_the_mark_lists_what_was_written(exported):
+    found = OwnFolder(exported.output, "fit")
+    there = {path.relative_to(exported.output).as_posix() for path in exported.output.rglob("*")
+             if path.is_file()}
+    assert found.files == there - {MARK} >= {"mesh.ply", "scene.xml", "metrics.json", "views/view_000.png"}
+
+
+def test_what_is_in_the_way_of_an_export_stays(exported, tmp_path):
+    (tmp_path / "light.exr").write_text("precious")
+    with pytest.raises(UserError, match=r"light.exr' is in the way"):
+        export_fit(tmp_path, exported.fit, exported.joint.material, exported.joint.light, 1)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"light.exr": "precious"}
 
 
 def test_views(exported):
@@ -235,33 +269,3 @@ def test_up_axis(axis, up):
     sensors = [mi.load_dict({"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(
         list(rng.normal(size=3) + 2 * up), [0, 0, 0], list(up))}) for _ in range(12)]
     assert up_axis(sensors) == axis
-
-
-# --- the folder
-
-
-def test_folder_is_made_and_only_a_fits_own_files_go(tmp_path):
-    output = tmp_path / "a" / "b"
-    check_output_folder(output, keep=False, overwrite=False)
-    assert not (tmp_path / "a").exists(), "a check leaves no trace"
-    make_output_folder(output, keep=False)
-    for name in ("notes.txt", "mesh.ply", "checkpoint.npz"):
-        (output / name).write_text(name)
-    (output / "views").mkdir()
-    (output / "views" / "view_000.png").write_text("")
-    with pytest.raises(UserError, match=r"holds an earlier fit \(mesh.ply\)"):
-        check_output_folder(output, keep=False, overwrite=False)
-    check_output_folder(output, keep=True, overwrite=False)
-    make_output_folder(output, keep=True)
-    assert len(list(output.iterdir())) == 4
-    check_output_folder(output, keep=False, overwrite=True)
-    make_output_folder(output, keep=False)
-    assert [path.name for path in output.iterdir()] == ["notes.txt"]
-
-
-def test_folder_below_a_file(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"cannot be made because '.*file' is a file"):
-        check_output_folder(tmp_path / "file" / "out", keep=False, overwrite=False)
-    with pytest.raises(UserError, match="cannot be written"):
-        make_output_folder(tmp_path / "file" / "out", keep=False)

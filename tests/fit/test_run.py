@@ -223,3 +223,25 @@ def test_asset_and_report_come_with_a_fit(bowl_scene, tmp_path):
     assert seconds["total"] == pytest.approx(sum(seconds.values()) - seconds["total"], abs=0.01)
     assert (output / "mesh.glb").read_bytes()[:4] == b"glTF"
     assert "model-viewer" in (output / "report.html").read_text()
+
+
+def test_overwriting_keeps_the_earlier_fit_until_the_new_one_is_there(bowl_scene, tmp_path):
+    """Interrupted and resumed meanwhile; what no fit wrote stays all along."""
+    output, options = tmp_path / "out", (*CLOSED, "--iterations", "1")
+    assert fit(bowl_scene, output, *options) == 0
+    (output / "views" / "holiday.jpg").write_text("mine")
+    before = {path: path.read_bytes() for path in output.rglob("*.*")}
+    longer = (*CLOSED, "--ghost-iterations", "30", "--iterations", "1")
+    assert fit(bowl_scene, output, *longer) == 2
+    process = start(bowl_scene, output, "--checkpoint-seconds", "0", "--overwrite", *longer)
+    wait_for_step(process, output / ".unfinished", "ghost", 5)
+    assert fit(bowl_scene, output, "--resume", *longer) == 2, "another run is writing there"
+    process.kill()
+    process.communicate()
+    assert {path: path.read_bytes() for path in before} == before
+    assert fit(bowl_scene, output, "--resume", *longer) == 0
+    counts = {"ghost": 30, "carving": 4, "refinement": 2, "joint": 1}
+    assert steps(output) == [(stage, i) for stage, count in counts.items() for i in range(count)]
+    assert (output / "views" / "holiday.jpg").read_text() == "mine" and not list(output.glob(".*"))
+    assert {path.relative_to(output) for path in output.rglob("*.*")} == {
+        path.relative_to(output) for path in before}

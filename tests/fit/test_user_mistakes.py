@@ -16,6 +16,7 @@ from gshell_mi.errors import UserError
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+from gshell_mi.own_folder import OwnFolder
 
 
 @pytest.fixture
@@ -113,6 +114,32 @@ def test_no_light(told, scene):
 def test_light_of_another_kind(told, scene):
     change(scene, '<emitter type="constant" id="light"/>', '<emitter type="point" id="light"/>')
     assert "no environment emitter with the id 'light'" in told()
+
+
+@pytest.mark.parametrize("emitter", ['<emitter type="point" id="p"/>', """
+    <shape type="rectangle" id="window"> <emitter type="area" id="p"/> </shape>"""])
+def test_another_emitter(told, scene, emitter):
+    change(scene, "</shape>", f"</shape> {emitter}")
+    assert "has another emitter beside 'light' ('p'); a fit explains the images by one environment" in told()
+
+
+@pytest.mark.parametrize(("name", "reason"), [
+    ("../../escaped", "has a '/'"), ("cam/3", "has a '/'"), ("a\\b", "has a '\\'"), ("..", "is no name"),
+    ("x" * 245, "is longer than 200 bytes"), ("x" * 300, "is longer than 200 bytes"),
+    ("&#10;", "cannot be printed"), ("ü" * 101, "is longer than 200 bytes")])
+def test_ids_that_are_no_names_of_files(told, scene, name, reason):
+    change(scene, '"view_004"', f'"{name}"')
+    assert reason in told()
+    assert not list(scene.parent.parent.glob("escaped*"))
+
+
+def test_an_id_with_quotes_and_spaces(scene, tmp_path):
+    change(scene, '"view_000"', '"&quot;a&quot; &amp; b"')
+    target(scene, "view_000").rename(target(scene, '"a" & b'))
+    assert main([str(scene), "-o", str(tmp_path / "out"), *SHORT, *CLOSED, "--iterations", "0"]) == 0
+    assert (tmp_path / "out" / "views" / '"a" & b.png').is_file()
+    ids = [sensor.id() for sensor in mi.load_file(str(tmp_path / "out" / "scene.xml")).sensors()]
+    assert ids[0] == '"a" & b'
 
 
 def test_unknown_grid(told, scene):
@@ -272,19 +299,62 @@ def test_output_that_not_even_root_may_write(told):
 
 def test_earlier_fit_is_kept(told, tmp_path):
     output = tmp_path / "out"
-    output.mkdir()
-    (output / "mesh.ply").write_text("precious")
+    write_mesh(output)
     assert "holds an earlier fit (mesh.ply)" in told()
     assert (output / "mesh.ply").read_text() == "precious"
 
 
 def test_earlier_fit_survives_a_mistake_with_overwrite(told, scene, tmp_path):
     output = tmp_path / "out"
-    output.mkdir()
-    (output / "mesh.ply").write_text("precious")
+    write_mesh(output)
     target(scene).unlink()
     assert "is missing" in told("--overwrite")
     assert (output / "mesh.ply").read_text() == "precious"
+
+
+def write_mesh(output: Path) -> None:
+    """As an earlier fit has left it."""
+    output.mkdir()
+    OwnFolder(output, "fit").claim("mesh.ply")
+    (output / "mesh.ply").write_text("precious")
+
+
+@pytest.mark.parametrize("options", [(), ("--overwrite",)])
+def test_the_scene_in_the_output_folder_stays(told, scene, options):
+    scene.rename(scene.parent / "scene.xml")
+    scene.with_suffix("").rename(scene.parent / "scene")
+    scene = scene.parent / "scene.xml"
+    before = scene.read_bytes()
+    assert f"'{scene}' is in the way" in told(*options, path=scene, output=scene.parent)
+    assert scene.read_bytes() == before
+
+
+def test_targets_in_the_output_folder_stay(scene, tmp_path):
+    output = tmp_path / "out"
+    shutil.copytree(scene.with_suffix(""), output / "views")
+    (output / "views" / "holiday.jpg").write_bytes(b"mine")
+    before = {path: path.read_bytes() for path in output.rglob("*.*")}
+    options = ["--targets", str(output / "views"), "--overwrite", "--iterations", "0"]
+    assert main([str(scene), "-o", str(output), *SHORT, *CLOSED, *options]) == 0
+    assert {path: path.read_bytes() for path in before} == before
+    assert (output / "views" / "view_000.png").is_file()
+
+
+def test_a_light_that_the_scene_reads_stays(told, scene, tmp_path):
+    output = tmp_path / "out"
+    output.mkdir()
+    OwnFolder(output, "fit").claim("light.exr")
+    mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(output / "light.exr"))
+    change(scene, '<emitter type="constant" id="light"/>',
+           f'<default name="map" value="{output}/light.exr"/> <emitter type="envmap" id="light"> '
+           '<string name="filename" value="$map"/> </emitter>')
+    assert f"'{output / 'light.exr'}' is read by this run and would be replaced by it" in told("--overwrite")
+
+
+def test_a_folder_of_a_capture(told, tmp_path):
+    (tmp_path / "out").mkdir()
+    OwnFolder(tmp_path / "out", "capture").write_mark([])
+    assert f"'{tmp_path / 'out'}' was written by gshell_mi.capture" in told("--overwrite")
 
 
 def test_resume_without_checkpoint(told):
@@ -296,13 +366,14 @@ def stopped(scene, tmp_path, monkeypatch) -> Path:
     """The folder of a fit that was interrupted after its first stage."""
     from gshell_mi.fit import run
 
-    def interrupt(self):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(run._Fit, "_ghost", interrupt)
+        patch.setattr(run._Fit, "_ghost", _interrupt)
         assert main([str(scene), "-o", str(tmp_path / "out"), *SHORT]) == 130
     return tmp_path / "out"
+
+
+def _interrupt(self):
+    raise KeyboardInterrupt
 
 
 def test_interrupt_says_how_to_go_on(scene, stopped, capfd):
@@ -312,6 +383,62 @@ def test_interrupt_says_how_to_go_on(scene, stopped, capfd):
 
 def test_resume_with_other_settings(told, stopped):
     assert "was made with max_depth = 2, not 3" in told("--resume", "--max-depth", "3")
+
+
+@pytest.mark.parametrize(("old", "new", "words"), [
+    ('value="20"', 'value="24"', "(lattice: flexicubes, 20 cells instead of flexicubes, 24 cells)"),
+    ('<integer name="resolution" value="20"/>',
+     '<integer name="resolution" value="20"/> <string name="grid" value="tet"/>',
+     "(lattice: flexicubes, 20 cells instead of tet, 20 cells)"),
+    ("</shape>", '<transform name="to_world"> <scale value="2"/> </transform> </shape>',
+     "(to_world of the gshell shape)"),
+    ("</shape>", '<bsdf type="diffuse"> <rgb name="reflectance" value="0.1"/> </bsdf> </shape>',
+     "(material of the gshell shape)"),
+    ("</shape>", '</shape> <shape type="sphere"> <point name="center" x="9" y="0" z="0"/> </shape>',
+     "(objects beside the gshell shape)"),
+    ('<emitter type="constant" id="light"/>',
+     '<emitter type="constant" id="light"> <rgb name="radiance" value="2"/> </emitter>',
+     "(initial light)"),
+    ('"32"', '"33"', "(cameras of 'view_000')"),
+])
+def test_resume_with_another_scene(told, scene, stopped, old, new, words):
+    change(scene, old, new)
+    assert words in told("--resume")
+
+
+def test_resume_with_other_targets(told, scene, stopped):
+    rewrite(target(scene), lambda pixels: 0.9 * pixels)
+    assert "(images of 'view_003'); resume with the same" in told("--resume")
+
+
+def test_resume_with_fewer_views(told, scene, stopped):
+    sensors = re.compile(r'<sensor type="perspective" id="view_00[2-9].*?</sensor>', re.DOTALL)
+    scene.write_text(sensors.sub("", scene.read_text()))
+    words = "(12 views instead of 4: 'view_002', 'view_003', 'view_004' ...)"
+    assert words in told("--resume")
+
+
+def test_resume_with_a_copy_elsewhere(scene, stopped, tmp_path):
+    """It is not the name of the scene that counts; a comment changes nothing either."""
+    shutil.copytree(scene.parent, tmp_path / "copy")
+    copy = (tmp_path / "copy" / scene.name).rename(tmp_path / "copy" / "other.xml")
+    change(copy, "<shape", "<!-- the same --> <shape")
+    options = ["--targets", str(tmp_path / "copy" / "bowl"), "--resume"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gshell_mi.fit.run._Fit._ghost", _interrupt)
+        assert main([str(copy), "-o", str(stopped), *SHORT, *options]) == 130
+
+
+@pytest.mark.parametrize("damage", [
+    b"garbage\n", b"\n", b"\0\0\0\n", b"5\n", b'{"stage": "tea"}\n', b"\xff\xfe\n", b"{}",
+    b'{"stage": "ghost", "iteration": "1"}\n', b"[" * 9000 + b"\n"])
+def test_a_damaged_log_is_no_reason_to_stop(scene, stopped, damage):
+    (stopped / "log.jsonl").write_bytes(damage)
+    assert main([str(scene), "-o", str(stopped), *SHORT, "--ghost-iterations", "1", "--resume"]) == 2
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gshell_mi.fit.run._Fit._ghost", _interrupt)
+        assert main([str(scene), "-o", str(stopped), *SHORT, "--resume"]) == 130
+    assert (stopped / "log.jsonl").read_bytes() == b""
 
 
 def test_damaged_checkpoint(told, stopped):

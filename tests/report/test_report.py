@@ -4,6 +4,7 @@ import io
 import json
 import re
 import shutil
+import threading
 from dataclasses import asdict
 
 import numpy as np
@@ -11,11 +12,14 @@ import pytest
 from fitted import open_sphere, write_fit
 from PIL import Image
 
+from gshell_mi import UserError
 from gshell_mi.export.gltf import read_part
+from gshell_mi.files import locked
 from gshell_mi.fit.config import FitConfig
+from gshell_mi.own_folder import OwnFolder
 from gshell_mi.report import ReportConfig, write_report
 from gshell_mi.report.__main__ import main
-from gshell_mi.report.curves import curves
+from gshell_mi.report.metrics import read_metrics
 from gshell_mi.report.viewer_model import boundary_tubes, viewer_model
 from gshell_mi.topology import topology
 
@@ -57,24 +61,76 @@ def test_page_is_self_contained(folder):
     assert "ghost_iterations" in text and "seconds.hull" in text
 
 
-def test_curves(tmp_path):
-    log = tmp_path / "log.jsonl"
-    assert curves(log) == []
-    steps = [{"stage": "joint", "iteration": i, "loss": 10.0 ** -i, "psnr": i} for i in range(3)]
-    log.write_text("".join(json.dumps(step) + "\n" for step in steps))
-    losses, psnr = curves(log)
-    points = np.array([p.split(",") for p in re.search(r'points="([^"]*)"', losses)[1].split()], float)
-    assert np.ptp(np.diff(points, axis=0), axis=0) == pytest.approx(0, abs=0.2), "straight when logarithmic"
-    assert points[0, 1] < points[-1, 1] and "PSNR" in psnr
-    many = {f"loss_number_{i}": 1.0 + i for i in range(12)}
-    log.write_text(json.dumps({"stage": "joint", "iteration": 0, **many}) + "\n")
-    rows = [re.findall(r">([^<]+)</tspan>", row) for row in re.findall(r"<text[^>]*>(<tspan.*?)</text>",
-                                                                       curves(log)[0])]
-    told = [name for row in rows for name in row]
-    assert told == [name.replace("_", " ") for name in many], "a legend of rows that fit"
-    assert all(sum(map(len, row)) <= 70 for row in rows)
-    log.write_text(json.dumps({"stage": "joint", "iteration": 0, "loss": float("nan")}) + "\n")
-    assert "polyline" not in "".join(curves(log))
+METRICS = {"scene": "a.xml", "psnr_training": 30.0, "psnr_per_view": {"view_000": 30.0}, "versions": {},
+           "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1},
+           "seconds": {"total": 1.0}, "config": {}}
+
+
+def test_metrics_of_a_fit_are_read(tmp_path):
+    (tmp_path / "metrics.json").write_text(json.dumps(METRICS))
+    assert read_metrics(tmp_path / "metrics.json") == METRICS
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("{}", "'scene' is missing"), ("[]", "it is no object"), ("5", "it is no object"),
+    *((json.dumps({key: value for key, value in METRICS.items() if key != name}), f"'{name}' is missing")
+      for name in METRICS),
+    *((json.dumps(METRICS | change), words) for change, words in (
+        ({"scene": 5}, "'scene' is no str"), ({"psnr_training": "30"}, "'psnr_training' is no number"),
+        ({"psnr_training": float("nan")}, "'psnr_training' is no number"),
+        ({"psnr_training": 10**400}, "'psnr_training' is no number"),
+        ({"counts": [3]}, "'counts' is no dict"), ({"counts": {"vertices": 3}}, "'counts.faces' is no"),
+        ({"seconds": {}}, "'seconds.total' is no"), ({"psnr_per_view": {"a": None}}, "'psnr_per_view' holds"),
+        ({"warnings": "x"}, "'warnings' is no list"), ({"diagnostics": 1}, "'diagnostics' is no"),
+        ({"config": {"a": [[[[[[[[1]]]]]]]]}}, "it is nested too deeply"))),
+])
+def test_metrics_that_no_fit_wrote(folder, tmp_path, capsys, text, words):
+    shutil.copytree(folder, tmp_path / "fit")
+    (tmp_path / "fit" / "metrics.json").write_text(text)
+    before = (tmp_path / "fit" / "report.html").read_bytes()
+    assert main([str(tmp_path / "fit")]) == 2
+    error = capsys.readouterr().err
+    assert f"metrics.json' is not what a fit writes ({words}" in error and error.count("\n") == 1
+    assert (tmp_path / "fit" / "report.html").read_bytes() == before
+
+
+@pytest.mark.parametrize("text", ["", "{", "[" * 100_000, "9" * 5000, "\udcff"])
+def test_metrics_that_are_no_json(tmp_path, text):
+    (tmp_path / "metrics.json").write_text(text, errors="surrogateescape")
+    with pytest.raises(UserError, match="is missing or no JSON"):
+        read_metrics(tmp_path / "metrics.json")
+
+
+@pytest.mark.parametrize(("name", "words"), [
+    ("mesh.glb", "mesh.glb' is damaged"),
+    ("views/view_000.png", "view_000.png' cannot be read as an image"),
+    ("light.exr", "light.exr"), ("mesh.ply", "mesh.ply")])
+@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: b"garbage", lambda data: data[:30]])
+def test_damaged_files_of_a_fit(folder, tmp_path, capsys, name, words, damage):
+    shutil.copytree(folder, tmp_path / "fit")
+    (tmp_path / "fit" / name).write_bytes(damage((folder / name).read_bytes()))
+    assert main([str(tmp_path / "fit"), "--turntable-frames", "1", "--turntable-size", "16"]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.startswith("error: ") and error.count("\n") == 1
+
+
+def test_a_report_of_somebody_elses_is_kept(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "fit")
+    OwnFolder(tmp_path / "fit", "fit").write_mark(["mesh.glb"])
+    (tmp_path / "fit" / "report.html").write_text("mine")
+    with pytest.raises(UserError, match=r"report.html' is in the way"):
+        write_report(tmp_path / "fit", SMALL)
+    assert (tmp_path / "fit" / "report.html").read_text() == "mine"
+
+
+def test_a_folder_that_a_fit_is_writing(folder, tmp_path, capsys):
+    shutil.copytree(folder, tmp_path / "fit")
+    told = []
+    with locked(tmp_path / "fit"):
+        thread = threading.Thread(target=lambda: told.append(main([str(tmp_path / "fit")])))
+        thread.start()
+        thread.join()
+    assert told == [2] and "Another run is writing into" in capsys.readouterr().err
 
 
 def test_model_of_the_view(folder):

@@ -1,5 +1,7 @@
 """Turntables: what is seen from where, in which colours, and the files."""
 
+import re
+
 import imageio_ffmpeg
 import mitsuba as mi
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from fitted import color_at, open_sphere, write_fit
 from PIL import Image
 
+from gshell_mi import UserError
 from gshell_mi.export.stock_scene import up_axis
 from gshell_mi.images import srgb
 from gshell_mi.turntable import TurntableConfig, render_turntable, write_video
@@ -19,7 +22,10 @@ SIZE = 64
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return write_fit(tmp_path_factory.mktemp("fit"), open_sphere(3))
+    parent = tmp_path_factory.mktemp("fits")
+    (parent / "fit.mp4").mkdir()
+    (parent / "fit").mkdir()
+    return write_fit(parent / "fit", open_sphere(3))
 
 
 def frame(folder, **settings) -> np.ndarray:
@@ -93,6 +99,26 @@ def test_camera_keeps_the_fits_up_axis(up, tmp_path):
     assert np.ptp(np.linalg.norm((origins - center) * (1 - np.array(up)), axis=1)) < 1e-4, "a circle"
 
 
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_objects_of_any_size_are_seen(scale):
+    vertices = scale * open_sphere(2).vertices
+    for sensor in orbit(vertices, 1, 3, 25.0, 16):
+        origin = np.array(mi.traverse(sensor)["to_world"].matrix).reshape(4, 4)[:3, 3]
+        distances = np.linalg.norm(vertices - origin, axis=1)
+        assert sensor.near_clip() < distances.min() and distances.max() < sensor.far_clip()
+
+
+@pytest.mark.parametrize("cut, words", [("sensor", "has no sensors"), ("emitter", "has no light"),
+                                        ("shape", "has no shape")])
+def test_scenes_that_no_fit_wrote(cut, words, tmp_path):
+    folder = write_fit(tmp_path, open_sphere(1), views=1, size=8)
+    text = (folder / "scene.xml").read_text(encoding="utf-8")
+    text = re.sub(rf"<{cut} .*</{cut}>", "", text, flags=re.DOTALL)
+    (folder / "scene.xml").write_text(text, encoding="utf-8")
+    with pytest.raises(UserError, match=words):
+        render_turntable(folder)
+
+
 def test_video_and_gif(tmp_path):
     ramp = [np.full((32, 48, 3), level) for level in np.linspace(0, 1, 5)]
     video, animation = write_video(iter(ramp), tmp_path / "a" / "turn.mp4", 10.0)
@@ -103,6 +129,76 @@ def test_video_and_gif(tmp_path):
     np.testing.assert_allclose([f.mean() / 255 for f in frames], np.linspace(0, 1, 5), atol=0.03)
     with Image.open(animation) as gif:
         assert gif.n_frames == 5 and gif.info["duration"] == 100 and gif.info["loop"] == 0
+
+
+def films(folder) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("name", ["-dash.mp4", "concat:a|b.mp4", "pipe:1.mp4", "tcp:127.0.0.1:9.mp4",
+                                  "a b;c.mp4", "%d.mp4", "$(x).mp4"])
+def test_any_name_is_a_files(folder, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    options = ["--frames", "2", "--size", "32", "--spp", "1", "--quiet"]
+    assert main([str(folder), f"--output={name}", *options]) == 0
+    assert set(films(tmp_path)) == {name, name.removesuffix("mp4") + "gif"}
+    assert imageio_ffmpeg.count_frames_and_secs(f"file:{tmp_path / name}")[0] == 2
+
+
+def test_a_film_is_replaced_by_a_film_alone(tmp_path):
+    frames = [np.zeros((32, 32, 3))] * 3
+    for _ in range(2):
+        write_video(iter(frames), tmp_path / "turn.mp4", 10.0)
+    for name in ("turn.mp4", "turn.gif"):
+        (tmp_path / name).write_bytes(b"holiday")
+        before = films(tmp_path)
+        with pytest.raises(UserError, match=f"{name}' exists and was not written by gshell_mi"):
+            write_video(iter(frames), tmp_path / "turn.mp4", 10.0)
+        assert films(tmp_path) == before
+        (tmp_path / name).unlink()
+
+
+def test_ffmpeg_that_fails(tmp_path, monkeypatch):
+    """Whenever it does: at once, at the end, or as if nothing had been."""
+    frames = [np.zeros((32, 32, 3))] * 3
+    write_video(iter(frames), tmp_path / "turn.mp4", 10.0)
+    before = films(tmp_path)
+    for script in ("echo 'x: Disk on fire' >&2; exit 1", "cat >/dev/null; echo 'Disk on fire' >&2; exit 3"):
+        ffmpeg = tmp_path.parent / "ffmpeg"
+        ffmpeg.write_text(f"#!/bin/sh\n{script}\n")
+        ffmpeg.chmod(0o755)
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(ffmpeg))
+        with pytest.raises(UserError, match=r"turn.mp4' cannot be written \(ffmpeg: Disk on fire\)"):
+            write_video(iter(frames * 100), tmp_path / "turn.mp4", 10.0)
+        assert films(tmp_path) == before
+    ffmpeg.write_text("#!/bin/sh\ncat >/dev/null\n")
+    with pytest.raises(UserError, match="ffmpeg: no reason given"):
+        write_video(iter(frames), tmp_path / "turn.mp4", 10.0)
+    assert films(tmp_path) == before
+
+
+def test_a_full_disk_leaves_the_earlier_film(tmp_path):
+    resource = pytest.importorskip("resource")
+    noise = np.random.default_rng(0).random((4, 64, 64, 3))
+    write_video(iter(noise[:1]), tmp_path / "turn.mp4", 10.0)
+    before, limits = films(tmp_path), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8000, limits[1]))
+    try:
+        with pytest.raises(UserError, match=r"turn.mp4' cannot be written \("):
+            write_video(iter(noise), tmp_path / "turn.mp4", 10.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert films(tmp_path) == before
+
+
+def test_interrupted(tmp_path):
+    def frames():
+        yield np.zeros((32, 32, 3))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_video(frames(), tmp_path / "turn.mp4", 10.0)
+    assert films(tmp_path) == {}
 
 
 def test_command(folder, tmp_path, capsys):
@@ -122,6 +218,10 @@ def test_command(folder, tmp_path, capsys):
     (("{fit}", "--channel", "albedo"), "--channel 'albedo' is unknown; choose one of shaded"),
     (("{fit}", "--envmap", "{none}"), "does not exist; check the path"),
     (("{fit}", "--envmap", "{fit}/scene.xml"), "cannot be read"),
+    (("{fit}", "-o", "..", "--frames", "1", "--size", "16"), "is no name; give one such as turntable.mp4"),
+    (("{fit}", "-o", "/", "--frames", "1", "--size", "16"), "is no name; give one such as turntable.mp4"),
+    (("{fit}", "-o", "x" * 300, "--frames", "1", "--size", "16"), "is longer than 200 bytes"),
+    (("{fit}", "-o", "{fit}", "--frames", "1", "--size", "16"), "fit.mp4' exists and was not written by"),
     (("{fit}", "-o", "{fit}/mesh.ply/turn.mp4", "--frames", "1", "--size", "16"), "cannot be written"),
 ])
 def test_mistakes(folder, tmp_path, capsys, arguments, message):

@@ -1,7 +1,9 @@
 """The live view: that its server answers, and that a browser's connection gets what the fit finds."""
 
 import shutil
+import socket
 import sys
+import urllib.error
 import urllib.request
 
 import numpy as np
@@ -148,3 +150,62 @@ def test_in_a_browser(viewer, bowl_scene):
             page.wait_for_timeout(100)
         browser.close()
     assert complaints == []
+
+
+# --- who may look
+
+
+@pytest.mark.parametrize(("headers", "status"), [
+    ({}, 200), ({"Origin": "http://evil.example"}, 403), ({"Host": "evil.example"}, 403),
+    ({"Host": "localhost:9000", "Origin": "http://localhost:9000"}, 200),  # behind ssh -L
+    ({"Host": "localhost:9000", "Origin": "http://localhost:3000"}, 403), ({"Origin": "null"}, 403),
+])
+def test_it_answers_its_own_page_alone(viewer, headers, status):
+    request = urllib.request.Request(viewer.url.replace("localhost", "127.0.0.1"), headers=headers)
+    if status == 200:
+        assert urllib.request.urlopen(request).status == 200
+        return
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(request)
+    assert refused.value.code == status and b"<html" not in refused.value.read()
+
+
+@pytest.mark.parametrize(("origin", "taken"), [("http://evil.example", False), ("http://127.0.0.1:1", False),
+                                               (None, True), ("own", True)])
+def test_connections_of_other_origins_are_refused(viewer, origin, taken):
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    address = viewer.url.replace("http://localhost", "127.0.0.1")
+    origin = f"http://{address}" if origin == "own" else origin
+
+    def open_it():
+        return connect(f"ws://{address}", subprotocols=[f"viser-v{viser.__version__}"], origin=origin)
+
+    if taken:
+        with open_it() as client:
+            assert client.recv(timeout=20)
+        return
+    with pytest.raises(InvalidStatus, match="403"):
+        open_it()
+
+
+@pytest.mark.parametrize("port", [-1, 65536, 10**9])
+def test_no_port(port):
+    with pytest.raises(UserError, match=f"--viewer-port lies between 0 and 65535, unlike {port}"):
+        Viewer(port=port)
+
+
+def test_no_free_port():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 65535))
+        taken.listen()
+        with pytest.raises(UserError, match="No port from 65535 on is free; choose a smaller"):
+            Viewer(port=65535)
+
+
+def test_a_viser_of_another_build_is_refused(monkeypatch):
+    """Where the guard would not be asked, there is no view."""
+    monkeypatch.setattr(viser, "ViserServer", lambda **_: None)
+    with pytest.raises(UserError, match="cannot be kept to its own page"):
+        Viewer(port=0)

@@ -39,7 +39,7 @@ def read_capture(source: str | Path, *, format: str | None = None, images: str |
         raise UserError(
             f"'{source}' is no {'capture of the format ' + name if name else 'known capture'}: a folder with "
             f"transforms*.json (NeRF), cameras*.npz (IDR, NeuS), sparse/0 (COLMAP), poses_bounds.npy (LLFF) "
-            f"or an XML file of Mitsuba sensors is needed.")
+            f"or an XML file of Mitsuba sensors is needed; Metashape and RealityScan export to COLMAP.")
     if opencv_axes and name != "nerf":
         raise UserError(f"--opencv-axes is for NeRF's transforms.json, but '{source}' is of the format "
                         f"{name}; leave it out.")

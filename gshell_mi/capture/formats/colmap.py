@@ -15,6 +15,7 @@ import numpy as np
 from ...errors import UserError
 from ..camera import Camera, Distortion
 from ..decoding import image_size
+from ..file_names import existing
 from ..frames import Capture, Frame, camera_for_image, pose_of
 
 #: Number in binary models, and how many parameters each has.
@@ -23,16 +24,43 @@ _MODELS = {
 }
 _OTHER_MODELS = {5: "OPENCV_FISHEYE", 6: "FULL_OPENCV", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE",
                  9: "RADIAL_FISHEYE", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE"}
-_PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
+_PLACES = ("", "sparse", "colmap/sparse", "colmap")
 
 
 def find(source: Path) -> Path | None:
-    """The folder of the model: the given one or its usual sub-folders."""
+    """The folder of the model: the given one or its usual sub-folders; of several, that of most images."""
     for place in _PLACES:
-        for suffix in (".bin", ".txt"):
-            if all((source / place / (name + suffix)).is_file() for name in ("cameras", "images")):
-                return source / place
+        models = _models(source / place)
+        if models:
+            return max(models, key=_image_count) if len(models) > 1 else models[0]
     return None
+
+
+def _models(folder: Path) -> list[Path]:
+    """The folder itself, if it is a model, or the numbered ones in it, into which COLMAP splits its own."""
+    if _suffix(folder):
+        return [folder]
+    if folder.name != "sparse" or not folder.is_dir():
+        return []
+    numbered = sorted((path for path in folder.iterdir() if path.name.isdecimal()), key=lambda p: int(p.name))
+    return [path for path in numbered if _suffix(path)]
+
+
+def _suffix(folder: Path) -> str | None:
+    """Of the files of a model; the binary one if there are both."""
+    return next((suffix for suffix in (".bin", ".txt")
+                 if all((folder / (name + suffix)).is_file() for name in ("cameras", "images"))), None)
+
+
+def _image_count(model: Path) -> int:
+    """Roughly, as the model may be malformed."""
+    file = model / f"images{_suffix(model)}"
+    if file.suffix == ".bin":
+        with open(file, "rb") as stream:
+            return int.from_bytes(stream.read(8), "little")
+    with open(file, encoding="utf-8", errors="replace") as stream:
+        lines = (line for line in stream if not line.startswith("#"))
+        return sum(len(line.split(maxsplit=10)) >= 10 and not _are_keypoints(line) for line in lines)
 
 
 def read(source: Path, images: Path | None = None) -> Capture:
@@ -48,8 +76,10 @@ def read(source: Path, images: Path | None = None) -> Capture:
     """
     model = find(source)
     images = images or _image_folder(source, model)
-    binary = (model / "cameras.bin").is_file() and (model / "images.bin").is_file()
-    if binary:
+    others = [path for path in _models(model.parent) if path != model] if model != source else []
+    notes = [f"'{model.parent}' has {len(others) + 1} models; '{model.name}' is taken, as it has the most "
+             f"images: merge them in COLMAP (model_merger) for the others."] if others else []
+    if _suffix(model) == ".bin":
         cameras, poses = _read_cameras_bin(model / "cameras.bin"), _read_images_bin(model / "images.bin")
     else:
         cameras, poses = _read_cameras_txt(model / "cameras.txt"), _read_images_txt(model / "images.txt")
@@ -60,11 +90,17 @@ def read(source: Path, images: Path | None = None) -> Capture:
         if camera not in cameras:
             raise UserError(f"The COLMAP model in '{model}' has no camera {camera}, which '{name}' was taken "
                             f"with; export the model again.")
-        path = images / name
+        path = _image(images, name)
         pose = pose_of(_camera_to_world(quaternion, translation), f"image '{name}' of '{model}'")
         frames.append(Frame(path, camera_for_image(_camera(*cameras[camera], pose),
                                                    image_size(path), path)))
-    return Capture("COLMAP", source, tuple(frames))
+    return Capture("COLMAP", source, tuple(frames), notes=tuple(notes))
+
+
+def _image(folder: Path, name: str) -> Path:
+    # A model made on Windows may name its images with backslashes.
+    candidates = (folder / name, folder / name.replace("\\", "/"))
+    return next((found for found in map(existing, candidates) if found), candidates[0])
 
 
 def _image_folder(source: Path, model: Path) -> Path:
@@ -106,7 +142,7 @@ def _check_model(model: str, path: Path) -> None:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
+        return path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"'{path}' is no text file ({error}); export the model again.") from error
 
@@ -128,7 +164,7 @@ def _read_cameras_txt(path: Path) -> dict[int, tuple[str, int, int, np.ndarray]]
             parameters = np.array(words[4:], dtype=np.float64)
         except (ValueError, IndexError):
             raise _malformed(path, number) from None
-        if len(parameters) != _MODELS[model][1]:
+        if len(parameters) != _MODELS[model][1] or not 0 < min(width, height) <= max(width, height) < 2**31:
             raise _malformed(path, number)
         cameras[index] = (model, width, height, parameters)
     return cameras
@@ -136,11 +172,16 @@ def _read_cameras_txt(path: Path) -> dict[int, tuple[str, int, int, np.ndarray]]
 
 def _read_images_txt(path: Path) -> dict[str, tuple[int, np.ndarray, np.ndarray]]:
     poses = {}
-    # Every other line lists an image's keypoints and may be empty.
-    lines = [(number, line) for number, line in enumerate(_lines(path), 1) if not line.startswith("#")]
-    for number, line in lines[::2]:
-        if not line.strip():
+    keypoints_next = False
+    for number, line in enumerate(_lines(path), 1):
+        # As COLMAP reads: the line after an image's holds its keypoints, and may be empty; before an image,
+        # empty lines and comments do not count. Some exporters leave the keypoints' lines out.
+        if keypoints_next and _are_keypoints(line):
+            keypoints_next = False
             continue
+        if not line.strip() or line.startswith("#"):
+            continue
+        keypoints_next = True
         words = line.split(maxsplit=9)    # a name may hold spaces
         try:
             values = np.array(words[1:8], dtype=np.float64)
@@ -149,6 +190,18 @@ def _read_images_txt(path: Path) -> dict[str, tuple[int, np.ndarray, np.ndarray]
             raise _malformed(path, number) from None
         poses[name] = (camera, values[:4], values[4:7])
     return poses
+
+
+def _are_keypoints(line: str) -> bool:
+    """Whether a line lists x, y and the number of a 3-D point, any number of times."""
+    words = line.split()
+    if len(words) % 3:
+        return False
+    try:
+        np.array([words[:3], words[-3:]], dtype=np.float64)
+    except ValueError:    # the last word of an image's line is its name
+        return False
+    return True
 
 
 # --- binary, little-endian

@@ -17,6 +17,8 @@ from ..decoding import image_size, images_in
 from ..frames import Capture, Frame, camera_for_image, pose_of
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
+#: Bytes that the matrices may take; 100 000 views take a quarter.
+_LARGEST = 1 << 26
 _FOLDERS = ("image", "images", "rgb")
 
 
@@ -42,6 +44,9 @@ def read(source: Path, images: Path | None = None) -> Capture:
     files = images_in(folder)
     try:
         with np.load(path) as stored:
+            unpacked = sum(entry.file_size for entry in stored.zip.infolist())
+            if unpacked > _LARGEST:
+                raise ValueError(f"it unpacks to {unpacked >> 20} MiB")
             arrays = {key: np.array(stored[key], dtype=np.float64) for key in stored.files
                       if key.startswith(("world_mat_", "scale_mat_")) and "_inv" not in key}
     except Exception as error:

@@ -8,10 +8,15 @@ import mitsuba as mi
 import numpy as np
 
 from ...errors import UserError
+from ...scene_files import is_scene_file, load_scene
 from ...views import PinholeViews
 from ..camera import Camera
-from ..decoding import SUFFIXES, image_size
+from ..decoding import image_size
+from ..file_names import existing
 from ..frames import Capture, Frame, pose_of
+
+#: The format for people.
+NAME = "Mitsuba sensors"
 
 _Y_UP = np.array([0.0, 1.0, 0.0])
 #: Plugins by the names of their classes.
@@ -23,8 +28,9 @@ _FILTERS = {"BoxFilter": "box", "GaussianFilter": "gaussian", "TentFilter": "ten
 def find(source: Path) -> Path | None:
     """The XML file: the given one, or the only one in the folder that has sensors."""
     if source.is_file():
-        return source if source.suffix == ".xml" else None
-    found = [path for path in sorted(source.glob("*.xml")) if "<sensor" in path.read_text(errors="replace")]
+        return source if source.suffix.lower() == ".xml" and is_scene_file(source) else None
+    found = [path for path in sorted(source.glob("*.xml")) if path.is_file() and is_scene_file(path)
+             and b"<sensor" in path.read_bytes()]
     named = [path for path in found if path.name == "sensors.xml"]
     if len(found) > 1 and not named:
         names = ", ".join(path.name for path in found)
@@ -46,18 +52,16 @@ def read(source: Path, images: Path | None = None) -> Capture:
     path = find(source)
     try:
         path.read_text(encoding="utf-8")    # Mitsuba would take other bytes for names
-        sensors = mi.load_file(str(path)).sensors()
-    except Exception as error:
-        reason = (str(error).strip().splitlines() or [repr(error)])[0]
-        raise UserError(f"'{path}' cannot be loaded by Mitsuba ({reason}); correct the file.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"'{path}' cannot be loaded by Mitsuba ({error}); correct the file.") from error
+    sensors = load_scene(path).sensors()
     if not sensors:
         raise UserError(f"'{path}' has no sensors; add one per image, with the image's name as its id.")
     folders = [images] if images else [path.parent, path.parent / "images"]
     views = PinholeViews.from_sensors(sensors)
     frames = []
     for index, sensor in enumerate(sensors):
-        candidates = [folder / (sensor.id() + suffix) for folder in folders for suffix in SUFFIXES]
-        image = next((file for file in candidates if file.is_file()), None)
+        image = next((file for folder in folders if (file := existing(folder / sensor.id()))), None)
         if image is None:
             raise UserError(f"Image '{folders[0] / sensor.id()}' of the sensor in '{path}' is missing, with "
                             f"any suffix such as .exr; put it there or name its folder with --images.")
@@ -67,7 +71,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
             raise UserError(f"Image '{image}' is {width} x {height} pixels, but its sensor's film is "
                             f"{camera.width} x {camera.height}; resize one of them.")
         frames.append(Frame(image, camera))
-    return Capture("Mitsuba sensors", source, tuple(frames), up=_Y_UP)
+    return Capture(NAME, source, tuple(frames), up=_Y_UP)
 
 
 def camera_of(sensor: mi.Sensor, views: PinholeViews, index: int) -> Camera:

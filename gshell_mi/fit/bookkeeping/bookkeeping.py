@@ -13,13 +13,10 @@ import mitsuba as mi
 import numpy as np
 
 from ...files import replacing
-from .checkpoint import Checkpoint, optimizer_arrays, restore_optimizer
-from .interrupt import Interrupt
+from ...interrupt import Interrupt
+from .checkpoint import STAGES, Checkpoint, optimizer_arrays, restore_optimizer
 from .observer import Observer, Preview
 from .progress import Progress
-
-#: The stages of a fit, in their order.
-STAGES = ("hull", "ghost", "carving", "refinement", "folds", "volume", "field", "joint", "detail", "done")
 
 #: Between two checkpoints at least this many times what writing one takes.
 _CHECKPOINT_PAUSE = 10
@@ -117,16 +114,13 @@ class Bookkeeping:
         self._spent(stage, time.monotonic() - begin)
 
     def rewind_log(self) -> None:
-        """Drops the lines of steps that a killed run did after its last checkpoint: they are done again."""
-        kept = []
-        if self._log.exists():
-            reached = (STAGES.index(self.checkpoint.stage), self.checkpoint.iteration)
-            for line in self._log.read_text().splitlines(keepends=True):
-                step = json.loads(line) if line.endswith("\n") else None
-                if step and (STAGES.index(step["stage"]), step["iteration"]) < reached:
-                    kept.append(line)
+        """Drops the lines of steps that a killed run did after its last checkpoint: they are done again. So
+        are lines that are no steps; a damaged log is no reason to stop."""
+        reached = (STAGES.index(self.checkpoint.stage), self.checkpoint.iteration)
+        lines = self._log.read_bytes().splitlines(keepends=True) if self._log.exists() else []
+        kept = [line for line in lines if (step := _step_of(line)) is not None and step < reached]
         with replacing(self._log) as partial:
-            partial.write_text("".join(kept))
+            partial.write_bytes(b"".join(kept))
 
     def _step(self, stage: str, logged: int, count: int, worker: Worker, iteration: int) -> dict[str, float]:
         """One step, which the log and the observer hear of as the step ``logged`` of ``count``."""
@@ -146,6 +140,18 @@ class Bookkeeping:
         with open(self._log, "a") as log:
             log.write(json.dumps({"stage": stage, "iteration": iteration, **rounded,
                                   "seconds": round(seconds, 4)}) + "\n")
+
+
+def _step_of(line: bytes) -> tuple[int, int] | None:
+    """The stage's number and the step in it that a line of the log tells of; None if it is none."""
+    if not line.endswith(b"\n"):
+        return None
+    try:
+        step = json.loads(line)
+        stage, iteration = STAGES.index(step["stage"]), step["iteration"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return (stage, iteration) if type(iteration) is int else None
 
 
 def checkpoint_path(output: Path) -> Path:

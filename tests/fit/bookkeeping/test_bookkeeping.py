@@ -6,8 +6,8 @@ import pytest
 
 from gshell_mi.fit.bookkeeping.bookkeeping import Bookkeeping
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
-from gshell_mi.fit.bookkeeping.interrupt import Interrupt
 from gshell_mi.fit.bookkeeping.progress import Progress
+from gshell_mi.interrupt import Interrupt
 
 COUNT = 3
 

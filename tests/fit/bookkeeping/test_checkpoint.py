@@ -114,6 +114,79 @@ def test_another_version(tmp_path):
         Checkpoint.load(tmp_path / "checkpoint.npz")
 
 
+def crafted(path, change) -> None:
+    """The checkpoint with another header, or other arrays below it."""
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    header = json.loads(str(arrays.pop("header")))
+    header = change(header, arrays) or header
+    np.savez(path, header=np.array(json.dumps(header)), **arrays)
+
+
+def rename(arrays, before, after):
+    arrays[after] = arrays.pop(before)
+
+
+@pytest.mark.parametrize("change", [
+    lambda header, arrays: [1], lambda header, arrays: 5, lambda header, arrays: header | {"more": 1},
+    lambda header, arrays: header | {"stage": "tea"}, lambda header, arrays: header | {"stage": 3},
+    lambda header, arrays: header | {"iteration": -5}, lambda header, arrays: header | {"iteration": "1"},
+    lambda header, arrays: header | {"iteration": True}, lambda header, arrays: header | {"config": []},
+    lambda header, arrays: header | {"seconds": [1]},
+    lambda header, arrays: header | {"seconds": {"hull": "1"}},
+    lambda header, arrays: header | {"inputs": 1}, lambda header, arrays: header | {"inputs": {"views": 1}},
+    lambda header, arrays: header.pop("arrays") and None, lambda header, arrays: header.pop("facts") and None,
+    lambda header, arrays: arrays.pop("sdf") is None, lambda header, arrays: rename(arrays, "sdf", "sdg"),
+    lambda header, arrays: arrays.update(sdf=np.array(["a", "b"])),
+    lambda header, arrays: arrays.update(sdf=arrays["sdf"][:8]),
+    lambda header, arrays: arrays.update(sdf=arrays["sdf"].astype(np.float64)),
+    lambda header, arrays: arrays.update(sdf=np.array([{}], object)),
+])
+def test_crafted(checkpoint, tmp_path, change):
+    path = tmp_path / "checkpoint.npz"
+    checkpoint.save(path)
+    crafted(path, change)
+    with pytest.raises(UserError, match=r"checkpoint.npz' is damaged \(.+\); delete it"):
+        Checkpoint.load(path)
+
+
+def test_without_a_format(checkpoint, tmp_path):
+    checkpoint.save(tmp_path / "checkpoint.npz")
+    crafted(tmp_path / "checkpoint.npz", lambda header, arrays: header.pop("format") and None)
+    with pytest.raises(UserError, match="written by another version"):
+        Checkpoint.load(tmp_path / "checkpoint.npz")
+
+
+def test_one_that_unpacks_to_much_is_refused_unread(tmp_path):
+    """100 MB of zeros in 100 kB; ours are not compressed."""
+    zeros = np.zeros(100_000_000, np.uint8)
+    np.savez_compressed(tmp_path / "checkpoint.npz", header=np.array("{}"), sdf=zeros)
+    with pytest.raises(UserError, match=r"is damaged \(ValueError\)"):
+        Checkpoint.load(tmp_path / "checkpoint.npz")
+
+
+def test_a_missing_array_is_the_files_fault(tmp_path):
+    """As of one that was crafted whole."""
+    Checkpoint("ghost", 0, {}, {"sdf": np.zeros(8)}).save(tmp_path / "checkpoint.npz")
+    loaded = Checkpoint.load(tmp_path / "checkpoint.npz")
+    with pytest.raises(UserError, match=r"checkpoint.npz' is damaged \(it lacks 'hull'\)"):
+        loaded.arrays["hull"]
+
+
+def test_an_optimizer_of_another_size(tmp_path):
+    arrays = optimizer_arrays("shading", adam(False)) | {"shading/a/value": np.zeros(4, np.float32)}
+    with pytest.raises(UserError, match="'shading/a' has another size than this fit needs"):
+        restore_optimizer("shading", adam(False), arrays)
+
+
+@pytest.mark.skipif(os.name == "posix" and os.geteuid() == 0, reason="root may read anything")
+def test_unreadable(checkpoint, tmp_path):
+    checkpoint.save(tmp_path / "checkpoint.npz")
+    (tmp_path / "checkpoint.npz").chmod(0)
+    with pytest.raises(UserError, match=r"cannot be read \(Permission denied\); mend its permissions"):
+        Checkpoint.load(tmp_path / "checkpoint.npz")
+
+
 def test_a_full_disk_leaves_the_old_one(checkpoint, tmp_path, monkeypatch):
     path = tmp_path / "checkpoint.npz"
     checkpoint.save(path)

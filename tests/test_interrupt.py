@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from gshell_mi.fit.bookkeeping.interrupt import Interrupt
+from gshell_mi.interrupt import Interrupt
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,74 @@
+"""Which file a capture means: names without suffix, in another case, or from another machine."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+
+from .decoding import SUFFIXES
+
+
+def existing(named: Path) -> Path | None:
+    """The file of that name, or the one that differs in the suffix only: left out, or in another case."""
+    try:
+        if named.is_file():
+            return named
+        # Blender's sets leave the suffix out; a name's own dots are no suffix.
+        completed = (named.with_name(named.name + suffix) for suffix in SUFFIXES) if named.name else ()
+        found = next((file for file in completed if file.is_file()), None)
+        if found is not None or not named.parent.is_dir():
+            return found
+        there = _by_lower_suffix(str(named.parent), named.parent.stat().st_mtime_ns)
+    except (OSError, ValueError):    # names that cannot be a file's
+        return None
+    keys = [named.stem + named.suffix.lower(), *(named.name + suffix for suffix in SUFFIXES)]
+    return next((named.parent / there[key] for key in keys if key in there), None)
+
+
+@lru_cache(maxsize=16)
+def _by_lower_suffix(folder: str, changed: int) -> dict[str, str]:
+    names = sorted(file.name for file in Path(folder).iterdir() if file.is_file())
+    return {Path(name).stem + Path(name).suffix.lower(): name for name in reversed(names)}
+
+
+class Copies:
+    """Finds the counterparts of a capture's images in another folder, by as much of their paths as it has.
+
+    ``images/cam1/000.png`` may be ``cam1/000.png`` there, or ``000.png``; but an end of a path that two of
+    the images have in common says nothing, and is never used.
+
+    Args:
+        names: of all images, as paths with slashes; two of one name are the same image.
+    """
+
+    def __init__(self, names: Iterable[str]):
+        shared: Counter[tuple[str, ...]] = Counter()
+        for parts in {_parts(name) for name in names}:
+            shared.update((*tail[:-1], Path(tail[-1]).stem) for tail in _tails(parts))
+        self._shared = shared
+
+    def find(self, folder: Path, name: str, file: Callable[[Path], Path | None] = existing) -> Path | None:
+        """The counterpart of the image ``name`` in ``folder``; None if there is none that is surely its own.
+
+        Args:
+            file: the file that stands for a path in that folder, or None.
+        """
+        for tail in _tails(_parts(name)):
+            if self._shared[(*tail[:-1], Path(tail[-1]).stem)] > 1:
+                return None    # shorter tails are shared as well
+            if len(tail) == 1 or (folder / tail[0]).is_dir():
+                found = file(folder.joinpath(*tail))
+                if found is not None:
+                    return found
+        return None
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    return tuple(part for part in parts if part not in ("/", ".", "..") and not part.endswith(":"))
+
+
+def _tails(parts: tuple[str, ...]) -> list[tuple[str, ...]]:
+    return [parts[start:] for start in range(len(parts))]

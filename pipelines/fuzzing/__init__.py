@@ -1,0 +1,1 @@
+"""Damaged inputs for everything that reads files: how they are made, and what is done with them."""

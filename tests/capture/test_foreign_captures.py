@@ -1,0 +1,285 @@
+"""Captures as other programs and other machines write them; each with what has to come out."""
+
+import json
+import re
+import shutil
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from known_capture import known_cameras, straight_png, write_colmap, write_nerf
+from PIL import Image, ImageOps
+
+from gshell_mi.capture import CaptureConfig, read_capture
+from gshell_mi.capture.__main__ import main
+from gshell_mi.capture.formats import colmap
+from gshell_mi.capture.frames import Frame
+from gshell_mi.capture.masks import assign_masks, coverage_of
+from gshell_mi.capture.run import import_capture
+from gshell_mi.errors import UserError
+
+CAMERAS = known_cameras(8, width=16, height=12, fx=20.0, fy=20.0, cx=8.0, cy=6.0)
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("originals")
+    write_nerf(folder / "nerf", CAMERAS, "nerfstudio")
+    write_colmap(folder / "colmap", CAMERAS, binary=False)
+    return folder
+
+
+@pytest.fixture
+def nerf(originals, tmp_path):
+    return shutil.copytree(originals / "nerf", tmp_path / "nerf")
+
+
+@pytest.fixture
+def model(originals, tmp_path):
+    return shutil.copytree(originals / "colmap", tmp_path / "colmap")
+
+
+def change(folder, edit):
+    path = folder / "transforms.json"
+    document = json.loads(path.read_text(encoding="utf-8"))
+    edit(document)
+    path.write_text(json.dumps(document), encoding="utf-8")
+
+
+def names(capture, held_out):
+    return [frame.image.name for frame in capture.frames if frame.held_out == held_out]
+
+
+# --- split lists
+
+
+@pytest.mark.parametrize("spelling", ["images/{}", "./images/{}", "images\\{}", "images/../images/{}"])
+def test_split_lists_may_spell_names_in_another_way(spelling, nerf):
+    files = [f"frame_{k:05}.png" for k in range(8)]
+
+    def edit(document):
+        document["train_filenames"] = [spelling.format(name) for name in files[:5]]
+        document["val_filenames"] = [spelling.format(name) for name in files[5:]]
+
+    change(nerf, edit)
+    capture = read_capture(nerf)
+    assert (names(capture, False), names(capture, True)) == (files[:5], files[5:])
+
+
+def test_what_no_list_trains_on_is_held_out(nerf):
+    change(nerf, lambda d: d.update(train_filenames=["images/frame_00001.png"]))
+    assert names(read_capture(nerf), False) == ["frame_00001.png"]
+
+
+@pytest.mark.parametrize("value, words", [
+    (["images/none.png"], "is missing"), (5, "is no list of file names"), (True, "is no list"),
+    ([["images/frame_00001.png"]], "is no list"), (["images/extra.png"], "which no frame shows"),
+])
+def test_lists_that_match_nothing(value, words, nerf):
+    shutil.copy(nerf / "images/frame_00001.png", nerf / "images/extra.png")
+    change(nerf, lambda d: d.update(val_filenames=value))
+    with pytest.raises(UserError, match=words):
+        read_capture(nerf)
+
+
+# --- numbers and names in JSON
+
+
+@pytest.mark.parametrize("text", [
+    '{"frames": ' + "[" * 100_000, '{"w": ' + "9" * 5000 + "}",
+    '{"frames": [{"file_path": "/", "transform_matrix": []}]}',
+    '{"frames": [{"file_path": "images/frame_00001.png", "transform_matrix": [[' + "9" * 400 + "]]}]}",
+    '{"w": ' + "9" * 400 + ', "frames": [{"file_path": "images/frame_00001.png", "transform_matrix": '
+    + json.dumps(np.eye(4).tolist()) + "}]}",
+])
+def test_documents_that_break_readers(text, nerf, tmp_path, capfd):
+    (nerf / "transforms.json").write_text(text, encoding="utf-8")
+    assert main([str(nerf), "-o", str(tmp_path / "a.xml")]) == 2
+    assert re.fullmatch(r"error: .*\.", capfd.readouterr().err.strip())
+
+
+# --- other copies of the images
+
+
+def test_images_may_be_somewhere_else(nerf, tmp_path):
+    """In half the size, while the JSON has paths of another machine."""
+    half = tmp_path / "images_2"
+    half.mkdir()
+    for camera, frame in zip(CAMERAS, range(8), strict=True):
+        rgba = Image.fromarray(straight_png(camera.render()))
+        rgba.resize((8, 6)).save(half / f"frame_{frame:05}.png")
+
+    def edit(document):
+        for frame in document["frames"]:
+            frame["file_path"] = "D:\\scans\\" + frame["file_path"].replace("/", "\\")
+
+    change(nerf, edit)
+    with pytest.raises(UserError, match=r"is missing.* name the folder of the images with --images"):
+        read_capture(nerf)
+    capture = read_capture(nerf, images=half)
+    assert {frame.image.parent for frame in capture.frames} == {half}
+    assert capture.frames[0].camera.fx == pytest.approx(CAMERAS[0].fx / 2)
+    (half / "frame_00003.png").unlink()
+    with pytest.raises(UserError, match=r"frame_00003.png' of frame 3 .* is not in"):
+        read_capture(nerf, images=half)
+
+
+# --- COLMAP's text
+
+
+def test_models_without_lines_of_keypoints(model):
+    path = model / "sparse" / "0" / "images.txt"
+    whole = read_capture(model)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    kept = [line for line in lines if "IMG" in line]
+    path.write_text("\n".join(kept), encoding="utf-8")
+    assert len(kept) == len(whole.frames) == len(CAMERAS)
+    assert [f.image for f in read_capture(model).frames] == [f.image for f in whole.frames]
+
+
+def test_empty_lines_and_comments_before_images_do_not_count(model):
+    path = model / "sparse" / "0" / "images.txt"
+    path.write_text("# a comment\n\n" + path.read_text(encoding="utf-8"), encoding="utf-8-sig")
+    assert len(read_capture(model).frames) == len(CAMERAS)
+
+
+def test_keypoints_that_are_cut_off(model):
+    path = model / "sparse" / "0" / "images.txt"
+    path.write_text(path.read_text(encoding="utf-8") + "1.0 2.0\n", encoding="utf-8")
+    with pytest.raises(UserError, match=r"images.txt' is malformed in line"):
+        read_capture(model)
+
+
+def test_byte_order_mark(model):
+    path = model / "sparse" / "0" / "cameras.txt"
+    path.write_text(path.read_text(encoding="utf-8"), encoding="utf-8-sig")
+    assert len(read_capture(model).frames) == len(CAMERAS)
+
+
+def test_widths_of_hundreds_of_digits(model):
+    path = model / "sparse" / "0" / "cameras.txt"
+    path.write_text(path.read_text(encoding="utf-8").replace(" 16 12 ", f" {'9' * 400} 12 ", 1),
+                    encoding="utf-8")
+    with pytest.raises(UserError, match=r"cameras.txt' is malformed in line"):
+        read_capture(model)
+
+
+def test_of_several_models_the_one_with_most_images(model):
+    small = shutil.copytree(model / "sparse" / "0", model / "sparse" / "1")
+    (model / "sparse" / "0").rename(model / "sparse" / "2")
+    lines = (small / "images.txt").read_text(encoding="utf-8").splitlines()
+    short = [line for line in lines if "IMG" in line][:2]
+    (small / "images.txt").write_text("\n\n".join(short), encoding="utf-8")
+    assert colmap.find(model) == model / "sparse" / "2"
+    capture = read_capture(model)
+    assert len(capture.frames) == len(CAMERAS)
+    assert re.match(r".* has 2 models; '2' is taken", capture.notes[0])
+    assert len(read_capture(small, images=model / "images").frames) == 2
+
+
+def test_names_with_backslashes(model):
+    path = model / "sparse" / "0" / "images.txt"
+    found = read_capture(model)
+    (model / "images" / "inner").mkdir()
+    for frame in found.frames:
+        frame.image.rename(model / "images" / "inner" / frame.image.name)
+    text = path.read_text(encoding="utf-8")
+    for frame in found.frames:
+        text = text.replace(f" {frame.image.name}\n", f" inner\\{frame.image.name}\n")
+    path.write_text(text, encoding="utf-8")
+    assert {f.image.parent.name for f in read_capture(model).frames} == {"inner"}
+
+
+# --- XML of others
+
+
+def test_xml_that_is_not_mitsubas(tmp_path):
+    (tmp_path / "cameras.xml").write_text('<?xml version="1.0"?><document><chunk><sensors><sensor id="0"/>'
+                                          '</sensors></chunk></document>', encoding="utf-8")
+    for source in (tmp_path, tmp_path / "cameras.xml"):
+        with pytest.raises(UserError, match=r"is no known capture.* Metashape .* export to COLMAP"):
+            read_capture(source)
+
+
+# --- masks
+
+
+@pytest.mark.parametrize("layout, works", [("{camera}/{name}", True), ("deep/{camera}/{name}", True),
+                                           ("{name}", False)])
+def test_masks_of_images_of_one_name(layout, works, nerf):
+    """``deep``: images and masks in two levels of folders."""
+    inside = "deep/" if layout.startswith("deep") else ""
+
+    def edit(document):
+        for k, frame in enumerate(document["frames"]):
+            old, new = nerf / frame["file_path"], f"images/{inside}cam{k % 2}/{k // 2}.png"
+            (nerf / new).parent.mkdir(parents=True, exist_ok=True)
+            mask = nerf / "masks" / layout.format(camera=f"cam{k % 2}", name=f"{k // 2}.png")
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            rgba = np.array(Image.open(old))
+            Image.fromarray(rgba[..., 3]).save(mask)
+            Image.fromarray(rgba[..., :3]).save(nerf / new)
+            frame["file_path"] = new
+
+    change(nerf, edit)
+    capture = read_capture(nerf)
+    if not works:
+        with pytest.raises(UserError, match="neither the images' names nor their number"):
+            assign_masks(capture, None)
+        return
+    for frame, camera in zip(assign_masks(capture, None).frames, CAMERAS, strict=True):
+        assert (frame.mask.parent.name, frame.mask.name) == (frame.image.parent.name, frame.image.name)
+        alpha = coverage_of(frame, np.zeros((12, 16, 3), np.uint8))
+        np.testing.assert_allclose(alpha, camera.render()[..., 3], atol=0.01)
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_masks_that_were_turned_as_exif_tells(orientation, tmp_path):
+    values = np.random.default_rng(0).integers(0, 255, (6, 8), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    stored = Image.fromarray(values)
+    stored.getexif()[0x112] = orientation
+    ImageOps.exif_transpose(stored).save(tmp_path / "mask.png")
+    found = coverage_of(Frame(tmp_path / "a.jpg", None, tmp_path / "mask.png"), np.zeros((6, 8, 3), np.uint8))
+    np.testing.assert_allclose(found, values / 255, atol=1e-6)
+
+
+def test_grey_masks_are_told(nerf, tmp_path):
+    def edit(document):
+        for frame in document["frames"]:
+            rgba = np.array(Image.open(nerf / frame["file_path"]))
+            rgba[..., 3] = rgba[..., 3] // 4 * 3
+            Image.fromarray(rgba).save(nerf / frame["file_path"])
+
+    change(nerf, edit)
+    result = import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(resolution=8))
+    told = [warning for warning in result.warnings if "nowhere reach full coverage" in warning]
+    assert told and told[0].startswith("8 masks") and "frame_00000.png (0.74)" in told[0]
+
+
+# --- what is written
+
+
+def test_all_sensors_clip_at_the_same_depths(nerf, tmp_path):
+    """Mitsuba compiles each new pair of depths into its kernels."""
+    change(nerf, lambda d: d.update(val_filenames=["images/frame_00001.png"]))
+    import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(resolution=8))
+    files = [tmp_path / "a" / name for name in ("sensors.xml", "test.xml")]
+    text = "".join(path.read_text(encoding="utf-8") for path in files)
+    near, far = (set(re.findall(rf'"{name}" value="([^"]*)"', text)) for name in ("near_clip", "far_clip"))
+    assert len(near) == len(far) == 1
+    near, far = float(near.pop()), float(far.pop())
+    distances = [np.linalg.norm(camera.origin - [0.3, -0.2, 0.1]) for camera in CAMERAS]
+    assert near < min(distances) - 0.7 and far > max(distances) + 0.7
+    assert np.log2(near) % 1 == np.log2(far) % 1 == 0
+
+
+def test_light_with_infinity_is_refused(nerf, tmp_path):
+    radiance = np.ones((8, 16, 3), np.float32)
+    radiance[3, 5] = np.inf
+    mi.Bitmap(radiance).write(str(tmp_path / "sun.exr"))
+    with pytest.raises(UserError, match=r"--light .*sun.exr' holds NaN or infinity .*column 5, row 3"):
+        import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(light=tmp_path / "sun.exr"))
+    assert not (tmp_path / "a.xml").exists() and not (tmp_path / "a").exists()

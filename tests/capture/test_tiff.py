@@ -1,0 +1,47 @@
+"""TIFF files of every layout."""
+
+import numpy as np
+import pytest
+import tifffile
+
+from gshell_mi.capture.decoding import image_size, read_pixels
+from gshell_mi.errors import UserError
+
+PIXELS = np.random.default_rng(0).random((6, 8, 4)).astype(np.float32)
+
+
+def test_floating_point(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", PIXELS, photometric="rgb", extrasamples=["unassalpha"])
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.tif"), PIXELS)
+    assert image_size(tmp_path / "a.tif") == (8, 6)
+
+
+def test_colour_is_freed_of_alpha(tmp_path):
+    multiplied = PIXELS * np.append(PIXELS[..., 3:].repeat(3, axis=2), np.ones_like(PIXELS[..., :1]), axis=2)
+    tifffile.imwrite(tmp_path / "a.tif", multiplied, photometric="rgb", extrasamples=["assocalpha"])
+    np.testing.assert_allclose(read_pixels(tmp_path / "a.tif"), PIXELS, rtol=1e-5)
+    stored = np.array([[[50, 100, 20, 100], [0, 0, 0, 0], [255, 1, 0, 255]]], np.uint8)
+    tifffile.imwrite(tmp_path / "b.tif", stored, photometric="rgb", extrasamples=["assocalpha"])
+    expected = np.array([[[0.5, 1, 0.2, 100 / 255], [0, 0, 0, 0], [1, 1 / 255, 0, 1]]])
+    found = read_pixels(tmp_path / "b.tif")
+    assert found.dtype == np.uint16
+    np.testing.assert_allclose(found / 65535, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("options, expected", [
+    ({"photometric": "rgb", "planarconfig": "separate"}, (6, 8, 3)),
+    ({"photometric": "rgb"}, (6, 8, 3)),
+])
+def test_planes_and_pixels(options, expected, tmp_path):
+    stored = (255 * PIXELS[..., :3]).astype(np.uint8)
+    separate = np.moveaxis(stored, -1, 0) if "planarconfig" in options else stored
+    tifffile.imwrite(tmp_path / "a.tif", separate, **options)
+    found = read_pixels(tmp_path / "a.tif")
+    assert found.shape == expected
+    np.testing.assert_array_equal(found, stored)
+
+
+def test_colours_that_are_not_rgb(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((6, 8, 4), np.uint8), photometric="separated")
+    with pytest.raises(UserError, match="colours are stored as SEPARATED"):
+        read_pixels(tmp_path / "a.tif")
