@@ -13,7 +13,7 @@ SIZE = 48
 #: Options of the command that make the fit short. Those of the ghost suit so small a scene and few steps.
 SHORT = ("--ghost-iterations", "100", "--ghost-batch", "4096", "--ghost-smoothing", "8",
          "--ghost-mask", "0.01", "--ghost-binary", "0.015", "--ghost-closing", "0.003", "--ghost-gain", "100",
-         "--carving-iterations", "10", "--carving-batch", "4096",
+         "--carving-iterations", "10", "--carving-batch", "4096", "--volume-iterations", "0",
          "--refinement-iterations", "8", "--folds-iterations", "0", "--iterations", "12",
          "--spp", "2", "--primal-spp", "4", "--max-depth", "2", "--light-height", "8",
          "--no-report")

@@ -150,7 +150,7 @@ class FitConfig:
     volume_side: int = 256
     """Voxels per side of its last level."""
     volume_resolution: int = 128
-    """Cells per side of the lattice, at least, if the fit starts from it."""
+    """Cells per side of the lattice, at least, if the fit starts from it and --resolution does not say."""
     volume_batch: int = 131072
     """Rays per step over all pixels, of which those far from the masks are left out."""
     volume_density_lr: float = 0.3

@@ -11,9 +11,13 @@ import numpy as np
 from .. import losses
 from ..compat import mesh_scene
 from ..fields.smoothing import MeshDiffusion
+from ..targets import Target
 from ..views import PinholeViews
 from .config import FitConfig
 from .ghost.pixels import COVERED, PixelPool
+
+#: Pixels this near to a mask's outline do not judge: where a surface ends to a cell is found later.
+_OUTLINE = 3
 
 #: Batches of rays that tell the colours, and that judge.
 _LEARNT, _JUDGED = 60, 20
@@ -47,22 +51,26 @@ class Verdict:
 
 
 def judge(before: tuple[np.ndarray, np.ndarray], after: tuple[np.ndarray, np.ndarray], views: PinholeViews,
-          known: PixelPool, unknown: PixelPool, config: FitConfig) -> Verdict:
+          targets: list[Target], config: FitConfig) -> Verdict:
     """Compares two surfaces, each given as vertices (V, 3) and faces (F, 3).
 
-    Each has the mean colour that the same known pixels show it in, of one side and of the other. Whatever
-    neither can explain so, such as gloss, texture finer than the meshes, poses and noise, is in both errors
-    and cancels in their difference.
+    Each has the mean colour that half of the views show it in, of one side and of the other, and the other
+    half judges; then the other way round. Whatever neither can explain so, such as gloss, texture finer than
+    the meshes, poses and noise, is in both errors and cancels in their difference.
 
     Args:
-        known: pixels to take the colours from.
-        unknown: pixels of other views. Those beside the masks' outlines tell little: where a surface ends to
-            a cell is found later.
+        views, targets: the images. Pixels beside the masks' outlines do not count.
     """
-    (rays, first), (_, second) = (_errors_by_view(surface, views, known, unknown, config)
-                                  for surface in (before, after))
-    seen = rays > 0
-    errors = np.stack([first[seen], second[seen]]) / rays[seen]
+    every, errors = np.arange(len(views)), []
+    for half in (every[::2], every[1::2]):
+        other = np.setdiff1d(every, half) if len(every) > 1 else every
+        if not len(half):
+            continue
+        known, unknown = PixelPool(views, targets, other), PixelPool(views, targets, half, _OUTLINE)
+        (rays, first), (_, second) = (_errors_by_view(surface, views, known, unknown, config)
+                                      for surface in (before, after))
+        errors.append(np.stack([first[half], second[half]])[:, rays[half] > 0] / rays[half][rays[half] > 0])
+    errors = np.concatenate(errors, axis=1)
     difference = errors[0] - errors[1]
     noise = difference.std(ddof=1) / np.sqrt(len(difference)) if len(difference) > 1 else np.inf
     return Verdict(float(errors[0].mean()), float(errors[1].mean()), float(difference.mean()), float(noise))

@@ -23,6 +23,7 @@ _PER_SQUARE_CELL = 37_000  # resolution squared, as the surface grows: meshes, e
 _PER_WEIGHT = 20  # of FlexiCubes, if they are optimised: its gradient and Adam's moments, too ...
 _WEIGHTS_PER_SQUARE_CELL = 900  # ... where only blocks around the surface have some
 _PER_SAMPLE = 50  # of a rendered image
+_PER_SQUARE_VOXEL = 19_000  # of the radiance volume's side squared: a tablecloth fills 57 voxels each, of 340
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class MemoryEstimate:
         lattice: fields and the surface in them.
         targets: the images.
         samples: one rendered view.
+        volume: the radiance volume, gone before the samples come.
     """
 
     program: int
@@ -42,6 +44,7 @@ class MemoryEstimate:
     lattice: int
     targets: int
     samples: int
+    volume: int
 
     @classmethod
     def of(cls, config: FitConfig, resolution: int, sizes: np.ndarray, *,
@@ -74,11 +77,12 @@ class MemoryEstimate:
             hull=int((_PER_HULL_SAMPLE + _PER_VOTE * votes) * hull_samples),
             lattice=_PER_VERTEX * vertices + _PER_SQUARE_CELL * resolution**2 + _PER_WEIGHT * weights,
             targets=_PER_PIXEL * int(pixels.sum()),
-            samples=_PER_SAMPLE * int(pixels.max()) * max(config.primal_spp, config.spp))
+            samples=_PER_SAMPLE * int(pixels.max()) * max(config.primal_spp, config.spp),
+            volume=_PER_SQUARE_VOXEL * config.volume_side**2 if config.volume_iterations else 0)
 
     @property
     def total(self) -> int:
-        return self.program + self.targets + max(self.hull, self.lattice + self.samples)
+        return self.program + self.targets + max(self.hull, self.volume, self.lattice + self.samples)
 
     def require(self, free: int | None) -> None:
         """Refuses, by a ``UserError`` that says what to lower, a fit that needs more than ``free`` bytes."""
@@ -87,6 +91,7 @@ class MemoryEstimate:
             "hull": "lower --resolution or use fewer views",
             "lattice": "lower --resolution",
             "targets": "use fewer or smaller views (--max-size of the import)",
+            "volume": "lower --volume-side",
             "samples": "lower --primal-spp and --spp, or use smaller views (--max-size of the import)",
         }
         largest = max(cures, key=lambda name: getattr(self, name))

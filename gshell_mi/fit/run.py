@@ -65,6 +65,7 @@ from .start import (
     start_fields,
     start_light,
     start_material,
+    volume_lattice,
 )
 
 #: What the joint stage starts from.
@@ -72,9 +73,6 @@ _SURFACE = ("sdf", "msdf", "radiance", "known")
 
 #: Every eighth view is kept from the refinement and judges it.
 _HOLD_OUT = 8
-
-#: Pixels this near to a mask's outline do not judge a start: where a surface ends to a cell is found later.
-_OUTLINE = 3
 
 
 @dataclass(frozen=True)
@@ -198,6 +196,8 @@ class _Fit:
         """Says how much memory the fit needs, and refuses it if that much is not free."""
         sizes = np.array([sensor.film().crop_size() for sensor in sensors])
         lattice = fit_lattice(subject, self.config)
+        if self.config.volume_iterations and not subject.filename:
+            lattice = volume_lattice(lattice, self.config)
         self.memory = MemoryEstimate.of(self.config, lattice.resolution, sizes, grid=lattice.grid,
                                         report=self.report)
         free = free_memory_of_variant()
@@ -332,10 +332,9 @@ class _Fit:
     def _volume(self) -> None:
         """Starts the joint stage from the surface of a radiance volume if unseen views tell for it."""
         state, subject, config = self.checkpoint.arrays, self.scene.subject, self.config
-        known, _ = self._split_pixels()
         subject.set_fields(self._fields(state))
         surface = subject.surface.to_numpy()[:2]
-        volume = self._radiance_volume(state, known, surface)
+        volume = self._radiance_volume(state, surface)
         self.books.iterate("volume", config.volume_iterations, volume, volume.optimizers, state,
                            volume.arrays)
         with self.progress.stage("depth maps", len(self.views)) as advance, self.books.timed("volume"):
@@ -346,17 +345,16 @@ class _Fit:
         kept = {name: state[name] for name in _SURFACE} | {"light": state["light"]}
         if fields:
             with self.progress.stage("verdict", None), self.books.timed("volume"):
-                unknown = PixelPool(self.views, self.scene.targets, self._held_out(), _OUTLINE)
                 subject.set_fields(self._fields(fields))
                 verdict = judge(_as_fine(surface, subject.cell_size), subject.surface.to_numpy()[:2],
-                                self.views, known, unknown, config)
+                                self.views, self.scene.targets, config)
             self.checkpoint.facts["volume"] = dataclasses.asdict(verdict)
             self.checkpoint.facts["volume_kept"] = verdict.accepted
             if verdict.accepted:
                 kept |= fields | self._without_unseen(fields)
         self.books.enter("joint", **kept)
 
-    def _radiance_volume(self, state: Mapping[str, np.ndarray], known: PixelPool,
+    def _radiance_volume(self, state: Mapping[str, np.ndarray],
                          surface: tuple[np.ndarray, np.ndarray]) -> RadianceVolume:
         """A radiance volume inside the visual hull, or that of the checkpoint."""
         side, subject = RadianceVolume.first_side(self.config), self.scene.subject
@@ -365,11 +363,11 @@ class _Fit:
         points = mi.Transform4f(subject.to_world) @ mi.Point3f(x, y, z)
         hull = visual_hull(points, self.views, [target.rgba[..., 3] for target in self.scene.targets])
         hull = np.clip(hull.numpy() / subject.length_scale, -1, 1).reshape((side,) * 3)
-        return RadianceVolume(hull, subject.to_world, self.views, known, self.config, surface, state)
+        return RadianceVolume(hull, subject.to_world, self.views, self.pixels, self.config, surface, state)
 
     def _volume_lattice(self) -> Lattice:
-        last = self.last_lattice
-        return make_lattice(last.grid, max(last.resolution, self.config.volume_resolution))
+        """What the joint stage has if it starts from the volume."""
+        return volume_lattice(self.last_lattice, self.config)
 
     def _fields(self, arrays: Mapping[str, np.ndarray]) -> LatticeFields:
         closed = LatticeFields.closed(arrays["sdf"], self.last_lattice.grid)
@@ -410,14 +408,11 @@ class _Fit:
 
     def _split_pixels(self) -> tuple[PixelPool, PixelPool]:
         """Pixels to learn the shape from, and those of views kept apart to judge it."""
-        every, held_out = np.arange(len(self.views)), self._held_out()
+        every = np.arange(len(self.views))
+        held_out = every[::_HOLD_OUT]
         seen = np.setdiff1d(every, held_out) if len(every) > 1 else every
         known, unknown = (PixelPool(self.views, self.scene.targets, chosen) for chosen in (seen, held_out))
         return known, unknown
-
-    def _held_out(self) -> np.ndarray:
-        """The views kept apart to judge."""
-        return np.arange(len(self.views))[::_HOLD_OUT]
 
     def _joint(self) -> JointStage:
         """The joint stage on the lattice that the fit ends on; on a coarser one first, if there is one."""

@@ -40,6 +40,12 @@ def fit_lattice(subject: mi.Shape, config: FitConfig) -> Lattice:
     return make_lattice(grid, config.resolution or given.resolution)
 
 
+def volume_lattice(lattice: Lattice, config: FitConfig) -> Lattice:
+    """The lattice that a fit ends on that starts from a radiance volume: what the settings name, or fine
+    enough for what such a volume shows."""
+    return make_lattice(lattice.grid, config.resolution or max(lattice.resolution, config.volume_resolution))
+
+
 def check_given(scene: FitScene, config: FitConfig) -> None:
     """Whether the scene gives what the modes of the fit take from it.
 

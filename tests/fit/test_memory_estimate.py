@@ -32,7 +32,8 @@ def test_targets_grow_with_pixels_and_the_lattice_with_cells():
     (FitConfig(), 64, np.full((400, 2), 1000), "use fewer or smaller views"),
     (FitConfig(), 64, np.full((400, 2), 64), "lower --resolution or use fewer views"),
     (FitConfig(primal_spp=512), 64, SIZES, "lower --primal-spp and --spp"),
-    (FitConfig(), 16, SIZES[:2], "close other programs"),
+    (FitConfig(volume_iterations=0), 16, SIZES[:2], "close other programs"),
+    (FitConfig(), 16, SIZES[:2], "lower --volume-side"),
 ])
 def test_the_cure_is_for_what_takes_most(config, resolution, sizes, cure):
     estimate = MemoryEstimate.of(config, resolution, sizes)

@@ -90,10 +90,11 @@ def volume_surface(volume: RadianceVolume, scene: FitScene, lattice: Lattice,
     if not (sdf < 0).any():
         return None
     mesh, vertices, faces = closed_template(subject, sdf, lattice)
-    back = vertices - margin * cell * normals_at_vertices(vertices, faces)
+    # Smoothed positions would shrink rims.
     smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
-    back = np.stack([smooth(mi.Float(np.ascontiguousarray(column, np.float32))).numpy()
-                     for column in back.T], axis=1)
+    inwards = [smooth(mi.Float(np.ascontiguousarray(column, np.float32))).numpy()
+               for column in normals_at_vertices(vertices, faces).T]
+    back = vertices - margin * cell * np.stack(inwards, axis=1)
     template = GhostTemplate(mesh, vertices, faces, np.ones(len(vertices)), back)
     return VolumeSurface(template, back, volume.radiance_at(back))
 

@@ -1,0 +1,67 @@
+"""The judge of two surfaces: what is right is accepted and what is wrong rejected, also in noisy images."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from bowl import RADIUS, half_sphere
+from scipy.spatial import Delaunay
+
+from gshell_mi.fit import FitConfig
+from gshell_mi.fit.judge import Verdict, judge
+from gshell_mi.scene import load_fit_scene
+from gshell_mi.views import PinholeViews
+
+CONFIG = FitConfig(ghost_batch=16384)
+
+
+def _bowl() -> tuple[np.ndarray, np.ndarray]:
+    mesh = half_sphere(64)
+    return mesh.vertices, mesh.faces
+
+
+def _with_lid() -> tuple[np.ndarray, np.ndarray]:
+    """The bowl closed by a flat lid, which the masks do not tell from an opening."""
+    bowl = half_sphere(64)
+    angle = np.linspace(0, 2 * np.pi, 65)[:-1]
+    circle = np.stack([np.cos(angle), np.sin(angle)], 1)
+    flat = RADIUS * np.concatenate([np.zeros((1, 2)), *(radius * circle for radius in (0.3, 0.6, 0.8, 1.0))])
+    lid = trimesh.Trimesh(np.insert(flat, 1, 0, axis=1), Delaunay(flat).simplices)
+    both = trimesh.util.concatenate(bowl, lid)
+    return both.vertices, both.faces
+
+
+@pytest.fixture(scope="module")
+def scene(bowl_scene):
+    return load_fit_scene(bowl_scene)
+
+
+def _verdict(scene, before, after, spoil=lambda rgba: rgba) -> Verdict:
+    views = PinholeViews.from_sensors(scene.sensors)
+    targets = [dataclasses.replace(target, rgba=spoil(target.rgba).astype(np.float32))
+               for target in scene.targets]
+    return judge(before, after, views, targets, CONFIG)
+
+
+def test_an_opening_that_is_there_is_accepted_and_a_lid_rejected(scene):
+    opened, closed = _verdict(scene, _with_lid(), _bowl()), _verdict(scene, _bowl(), _with_lid())
+    assert opened.accepted and opened.gain > 0
+    assert not closed.accepted and closed.gain < 0
+    assert opened.gain == pytest.approx(-closed.gain, rel=1e-3)
+
+
+def test_nothing_is_gained_by_what_is_the_same(scene):
+    same = _verdict(scene, _bowl(), _bowl())
+    assert same.gain == pytest.approx(0, abs=1e-5) and not same.accepted
+
+
+def test_noise_in_the_images_does_not_change_what_is_accepted(scene):
+    rng = np.random.default_rng(0)
+
+    def noisy(rgba: np.ndarray) -> np.ndarray:
+        color = np.maximum(rgba[..., :3] + rng.normal(0, 0.05, rgba[..., :3].shape), 0) * rgba[..., 3:]
+        return np.concatenate([color, rgba[..., 3:]], axis=-1)
+
+    assert _verdict(scene, _with_lid(), _bowl(), noisy).accepted
+    assert not _verdict(scene, _bowl(), _with_lid(), noisy).accepted
