@@ -12,6 +12,8 @@ from PIL import Image, ImageOps
 
 from gshell_mi.capture import CaptureConfig, read_capture
 from gshell_mi.capture.__main__ import main
+from gshell_mi.capture.camera import Camera
+from gshell_mi.capture.evidence import read_ignored
 from gshell_mi.capture.formats import colmap
 from gshell_mi.capture.frames import Frame
 from gshell_mi.capture.masks import assign_masks, coverage_of
@@ -233,16 +235,20 @@ def test_masks_of_images_of_one_name(layout, works, nerf):
         np.testing.assert_allclose(alpha, camera.render()[..., 3], atol=0.01)
 
 
+@pytest.mark.parametrize("larger", [1, 3])
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
-def test_masks_that_were_turned_as_exif_tells(orientation, tmp_path):
+def test_masks_that_were_turned_as_exif_tells(orientation, larger, tmp_path):
     values = np.random.default_rng(0).integers(0, 255, (6, 8), dtype=np.uint8)
     exif = Image.Exif()
     exif[0x112] = orientation
     Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
-    stored = Image.fromarray(values)
+    stored = Image.fromarray(values.repeat(larger, axis=0).repeat(larger, axis=1))
     stored.getexif()[0x112] = orientation
     ImageOps.exif_transpose(stored).save(tmp_path / "mask.png")
-    found = coverage_of(Frame(tmp_path / "a.jpg", None, tmp_path / "mask.png"), np.zeros((6, 8, 3), np.uint8))
+    camera = Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4))
+    frame = Frame(tmp_path / "a.jpg", camera, tmp_path / "mask.png", ignored=tmp_path / "mask.png")
+    found = coverage_of(frame, np.zeros((6, 8, 3), np.uint8))
+    np.testing.assert_array_equal(read_ignored(frame, (6, 8), 1), found)
     np.testing.assert_allclose(found, values / 255, atol=1e-6)
 
 
