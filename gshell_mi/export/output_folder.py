@@ -106,6 +106,7 @@ class FitFolder:
     def finish(self) -> None:
         """Puts the fit in the place of the earlier one, if there is one."""
         if self.place != self.output:
+            remove_stale(self.place)  # what a kill has left there just before this run began
             OwnFolder(self.output, "fit").take_over(self.place, last=CHECKPOINT)
             OwnFolder(self.place, "fit").remove()
             self.place = self.output

@@ -245,3 +245,15 @@ def test_overwriting_keeps_the_earlier_fit_until_the_new_one_is_there(bowl_scene
     assert (output / "views" / "holiday.jpg").read_text() == "mine" and not list(output.glob(".*"))
     assert {path.relative_to(output) for path in output.rglob("*.*")} == {
         path.relative_to(output) for path in before}
+
+
+def test_a_volume_is_judged(bowl_scene, tmp_path):
+    output = tmp_path / "out"
+    options = (*CLOSED, "--iterations", "2", "--volume-iterations", "30", "--volume-side", "32",
+               "--volume-batch", "4096", "--resolution", "20", "--checkpoint-seconds", "0")
+    assert fit(bowl_scene, output, *options) == 0
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["volume"]["noise"] > 0
+    assert metrics["volume_kept"] is (metrics["volume"]["gain"] > 2 * metrics["volume"]["noise"])
+    assert [stage for stage, _ in steps(output)].count("volume") == 30
+    assert "volume" in metrics["seconds"]

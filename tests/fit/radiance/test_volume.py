@@ -1,0 +1,91 @@
+"""The radiance volume: it learns, goes on where it stopped, and its surface has what no silhouette shows."""
+
+import dataclasses
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from bowl import RADIUS
+
+from gshell_mi.fields.visual_hull import visual_hull
+from gshell_mi.fit import FitConfig
+from gshell_mi.fit.bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
+from gshell_mi.fit.ghost.pixels import PixelPool
+from gshell_mi.fit.radiance.volume import RadianceVolume
+from gshell_mi.fit.radiance.volume_surface import volume_surface
+from gshell_mi.lattice import make_lattice
+from gshell_mi.scene import FitScene, load_fit_scene
+from gshell_mi.views import PinholeViews
+
+CONFIG = FitConfig(volume_iterations=90, volume_side=48, volume_batch=16384)
+
+
+@pytest.fixture(scope="module")
+def scene(bowl_scene) -> FitScene:
+    return load_fit_scene(bowl_scene)
+
+
+def _volume(scene: FitScene, config: FitConfig = CONFIG, stored=None) -> RadianceVolume:
+    views = PinholeViews.from_sensors(scene.sensors)
+    side = RadianceVolume.first_side(config)
+    centre = (np.arange(side, dtype=np.float32) + 0.5) * (2 / side) - 1
+    z, y, x = (axis.ravel() for axis in np.meshgrid(centre, centre, centre, indexing="ij"))
+    alphas = [target.rgba[..., 3] for target in scene.targets]
+    hull = visual_hull(mi.Point3f(x, y, z), views, alphas).numpy().reshape((side,) * 3)
+    surface = np.zeros((1, 3), np.float32), np.zeros((0, 3), np.uint32)
+    return RadianceVolume(np.clip(hull, -1, 1), scene.subject.to_world, views,
+                          PixelPool(views, scene.targets), config, surface, stored)
+
+
+@pytest.fixture(scope="module")
+def trained(scene) -> RadianceVolume:
+    volume = _volume(scene)
+    volume.losses = [volume.step(iteration) for iteration in range(CONFIG.volume_iterations)]
+    return volume
+
+
+def test_it_learns_from_coarse_to_fine(trained):
+    losses = [step["image"] for step in trained.losses]
+    assert np.mean(losses[-10:]) < 0.4 * np.mean(losses[:10])
+    assert trained.bricks.side == CONFIG.volume_side
+    assert trained.bricks.voxel_count < 0.5 * CONFIG.volume_side**3, "empty space has no voxels"
+
+
+def test_its_depth_is_that_of_the_bowl(scene, trained):
+    """Also inside, which no silhouette shows."""
+    errors = []
+    for view in range(len(scene.sensors)):
+        ray = trained.views.pixel_rays(view)
+        depth = trained.depth(view).ravel()
+        points = np.array(ray.o).T + depth[:, None] * np.array(ray.d).T
+        seen = np.isfinite(depth) & (scene.targets[view].rgba[..., 3].ravel() > 0.99)
+        errors.append(np.abs(np.linalg.norm(points[seen], axis=1) - RADIUS))
+    assert np.median(np.concatenate(errors)) < 1.5 * 2 / CONFIG.volume_side
+
+
+def test_its_surface_is_near_the_bowl(scene, trained):
+    found = volume_surface(trained, scene, make_lattice("cube", 32))
+    assert found.positions.shape == found.radiance.shape == found.template.vertices.shape
+    below = found.positions[found.positions[:, 1] < -0.1]
+    radius = np.linalg.norm(below, axis=1)
+    assert np.percentile(np.abs(radius - RADIUS), 80) < 2 * 2 / 32
+    assert found.radiance.max() > 0.05
+
+
+def test_it_goes_on_where_it_stopped(scene):
+    config = dataclasses.replace(CONFIG, volume_iterations=20)
+    whole, first = _volume(scene, config), _volume(scene, config)
+    for iteration in range(20):
+        whole.step(iteration)
+    for iteration in range(14):
+        first.step(iteration)
+    stored = first.arrays() | optimizer_arrays("volume", first.optimizers["volume"])
+    second = _volume(scene, config, stored)
+    restore_optimizer("volume", second.optimizers["volume"], stored)
+    assert second.level == first.level == 2
+    for iteration in range(14, 20):
+        second.step(iteration)
+    assert (second.bricks.places == whole.bricks.places).all()
+    for name in ("density", "radiance", "direction"):
+        one, other = (volume.optimizers["volume"][name].numpy() for volume in (whole, second))
+        assert np.median(np.abs(one - other)) < 1e-3 * np.abs(one).max()
