@@ -181,6 +181,7 @@ class _Fit:
                                      self.config.triptychs, joint.detail)
                 metrics["config"] = _plain(self.config)
                 metrics |= findings(self.scene, self.views, joint.scene, self.progress.warn)
+                metrics["warnings"] = self.progress.warnings
             metrics = self._write_metrics(metrics)
             if self.report:
                 self._write_documents()

@@ -141,6 +141,8 @@ def test_without_alpha(bowl_scene, tmp_path, capfd):
     assert "warning: some targets have no alpha: coverage is taken as 1 and the mask losses are off." in told
     log = map(json.loads, (tmp_path / "out" / "log.jsonl").read_text().splitlines())
     assert all(step["mask"] == 0 for step in log if step["stage"] == "joint")
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert any("no alpha" in warning for warning in metrics["warnings"])
 
 
 def test_camera_inside_the_box(bowl_scene, tmp_path):

@@ -1,8 +1,12 @@
-"""Progress on the terminal: one bar per stage with loss, PSNR, seconds per step and time left."""
+"""Progress on the terminal: one bar per stage with loss, PSNR, seconds per step and time left.
+
+Without a terminal, as in a log file, a stage prints a line when it begins and ends, and every half a minute.
+"""
 
 from __future__ import annotations
 
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,18 +18,27 @@ from rich.progress import Progress as RichProgress
 #: Steps whose mean duration predicts the time left; old ones say little about a stage that gets slower.
 _WINDOW = 20
 
+#: Seconds between two lines of a stage where there is no terminal.
+_PAUSE = 30.0
+
 
 class Progress:
-    """Progress bars on stderr; silent if ``quiet``.
+    """Progress bars on stderr; if ``quiet`` nothing but warnings, which are Python's then.
 
     The time left is that of the running stage: the steps that remain times what the last few took.
+
+    Attributes:
+        warnings: all that was warned of.
     """
 
     def __init__(self, *, quiet: bool = False):
         self._console = Console(stderr=True, quiet=quiet, highlight=False)
+        self._quiet, self.warnings = quiet, list[str]()
+        self._in_lines = not quiet and not self._console.is_terminal
         self._bars = RichProgress(
             SpinnerColumn(), TextColumn("{task.description:<12}"), BarColumn(bar_width=24),
-            TextColumn("{task.fields[detail]}"), console=self._console, disable=quiet)
+            TextColumn("{task.fields[detail]}"), console=self._console,
+            disable=quiet or self._in_lines)
         self._reference = None
 
     def __enter__(self) -> Progress:
@@ -41,17 +54,22 @@ class Progress:
 
     def warn(self, message: str) -> None:
         """The same for what may be wrong."""
-        self._console.print(f"[yellow]warning:[/] {message}")
+        self.warnings.append(message)
+        if self._quiet:
+            warnings.warn(message, stacklevel=2)
+        else:
+            self._console.print(f"[yellow]warning:[/] {message}")
 
     @contextmanager
     def stage(self, name: str, total: int | None, done: int = 0) -> Iterator[Callable]:
         """A bar for a stage of ``total`` steps; yields the function to call after each of them."""
         task = self._bars.add_task(name, total=total, completed=done, detail="")
         durations: deque[float] = deque(maxlen=_WINDOW)
-        begin = last = time.monotonic()
+        begin = last = shown = time.monotonic()
+        self._line(name, "begins" if total is None else f"{done}/{total}")
 
         def advance(values: Mapping[str, float] | None = None) -> None:
-            nonlocal last, done
+            nonlocal last, done, shown
             now = time.monotonic()
             durations.append(now - last)
             last = now
@@ -64,6 +82,9 @@ class Progress:
                 quality = f"  PSNR {values['psnr']:.1f} dB" if "psnr" in values else ""
                 detail = f"loss {values['loss']:.4f}{quality}  {detail}"
             self._bars.update(task, completed=done, detail=detail)
+            if now - shown >= _PAUSE:
+                shown = now
+                self._line(name, detail)
 
         try:
             yield advance
@@ -72,6 +93,11 @@ class Progress:
             raise
         took = f"{time.monotonic() - begin:.1f} s"
         self._bars.update(task, total=total or 1, completed=total or 1, detail=took)
+        self._line(name, f"took {took}")
+
+    def _line(self, name: str, detail: str) -> None:
+        if self._in_lines:
+            self._console.print(f"{name}: {detail}", soft_wrap=True)
 
     def reference(self, done: int, total: int) -> None:
         """Targets being rendered from a reference scene: ``done`` of ``total``."""

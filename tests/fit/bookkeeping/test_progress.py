@@ -28,3 +28,22 @@ def test_time_left_after_a_first_step_that_compiles(monkeypatch: pytest.MonkeyPa
             advance()
         assert re.fullmatch(r"10/100  0\.50 s/step  0:45 left", detail())
     assert detail() == "64.5 s"
+
+
+def test_without_a_terminal_a_stage_says_where_it_is(monkeypatch: pytest.MonkeyPatch, capfd):
+    now = [0.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    with Progress() as progress, progress.stage("joint", 100) as advance:
+        for _ in range(50):
+            now[0] += 1.0
+            advance({"loss": 0.5, "psnr": 20.0})
+    lines = capfd.readouterr().err.splitlines()
+    assert lines == ["joint: 0/100", "joint: loss 0.5000  PSNR 20.0 dB  30/100  1.00 s/step  1:10 left",
+                     "joint: took 50.0 s"]
+
+
+def test_a_quiet_warning_is_one_of_python():
+    progress = Progress(quiet=True)
+    with pytest.warns(UserWarning, match="no alpha"):
+        progress.warn("no alpha")
+    assert progress.warnings == ["no alpha"]
