@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -22,9 +23,7 @@ def begin_command() -> None:
     Descriptors 0 to 2 that are closed are opened, or the next file would take their place and be written by
     whoever prints.
     """
-    # As long as python -m looks for the module that is run, argv says just that.
-    module = sys.orig_argv[sys.orig_argv.index("-m") + 1] if "-m" in sys.orig_argv[:-1] else ""
-    if sys.argv[:1] != ["-m"] or not module.startswith("gshell_mi."):
+    if not _runs_command():
         return
     for descriptor in range(3):
         try:
@@ -33,6 +32,17 @@ def begin_command() -> None:
             os.open(os.devnull, os.O_RDWR)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, leave)
+
+
+def _runs_command() -> bool:
+    """Whether this process was started as ``python -m gshell_mi.NAME`` or as the console script
+    ``gshell-NAME``."""
+    started = "".join(sys.argv[:1])
+    # As long as python -m looks for the module that is run, argv says just that.
+    if started == "-m":
+        module = sys.orig_argv[sys.orig_argv.index("-m") + 1] if "-m" in sys.orig_argv[:-1] else ""
+        return module.startswith("gshell_mi.")
+    return re.fullmatch(r"gshell-[a-z]+(\.exe)?", os.path.basename(started)) is not None
 
 
 def leave(*_) -> None:
