@@ -1,6 +1,7 @@
 """Progress on the terminal: one bar per stage with loss, PSNR, seconds per step and time left.
 
-Without a terminal, as in a log file, a stage prints a line when it begins and ends, and every half a minute.
+Without a terminal, as in a log file, a stage prints a line after its first step, at its end, and every half a
+minute.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ class Progress:
         """A bar for a stage of ``total`` steps; yields the function to call after each of them."""
         task = self._bars.add_task(name, total=total, completed=done, detail="")
         durations: deque[float] = deque(maxlen=_WINDOW)
-        begin = last = shown = time.monotonic()
-        self._line(name, "begins" if total is None else f"{done}/{total}")
+        begin = last = time.monotonic()
+        shown = begin - _PAUSE
 
         def advance(values: Mapping[str, float] | None = None) -> None:
             nonlocal last, done, shown

@@ -38,7 +38,8 @@ def test_without_a_terminal_a_stage_says_where_it_is(monkeypatch: pytest.MonkeyP
             now[0] += 1.0
             advance({"loss": 0.5, "psnr": 20.0})
     lines = capfd.readouterr().err.splitlines()
-    assert lines == ["joint: 0/100", "joint: loss 0.5000  PSNR 20.0 dB  30/100  1.00 s/step  1:10 left",
+    assert lines == ["joint: loss 0.5000  PSNR 20.0 dB  1/100",
+                     "joint: loss 0.5000  PSNR 20.0 dB  31/100  1.00 s/step  1:09 left",
                      "joint: took 50.0 s"]
 
 
