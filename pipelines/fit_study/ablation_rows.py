@@ -60,7 +60,7 @@ ROWS = [
     *_group("Radiance volume",
             ("no-volume", "off", {"volume_iterations": 0}),
             ("volume-coarse", "half as many voxels per side", {"volume_side": 128}),
-            ("no-volume-direction", "no radiance that depends on the direction", {"volume_direction_lr": 0.0}),
+            ("no-volume-direction", "radiance has no direction", {"volume_direction_lr": 0.0}),
             ("no-volume-mask", "no mask loss", {"volume_mask": 0.0}),
             ("no-volume-distortion", "rays may see a spread", {"volume_distortion": 0.0})),
     *_group("Geometry in the joint stage",
