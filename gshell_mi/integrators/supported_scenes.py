@@ -3,10 +3,8 @@
 import warnings
 
 import mitsuba as mi
-import numpy as np
 
 from ..errors import UserError
-from ..wording import counted
 
 
 def has_surface_emitters(scene):
@@ -62,25 +60,9 @@ def unsupported(scene):
     return sentences
 
 
-def repeated_faces(meshes):
-    """Sentences about meshes some of whose faces are there twice, on whatever side."""
-    sentences = []
-    for mesh in meshes:
-        faces = np.sort(np.array(mi.traverse(mesh)["faces"]).reshape(-1, 3), axis=1)
-        faces = faces[faces[:, 0] < faces[:, 2]]    # a gshell's padding is no face
-        repeated = len(faces) - len(np.unique(faces, axis=0))
-        if repeated:
-            sentences.append(f"Mesh '{mesh.id()}' has {counted(repeated, 'repeated face')}: derivatives of "
-                             "shadows count their silhouettes twice; leave one of each out.")
-    return sentences
-
-
 def warn_once(scene, said):
     """Warns of everything in :func:`unsupported` that is not in the set ``said``, and adds it there."""
-    # Faces are looked at once per shape, as that costs more than all the rest.
-    new = [shape for shape in scene.shapes() if shape.is_mesh() and ("faces", shape.id()) not in said]
-    said.update(("faces", shape.id()) for shape in new)
-    for sentence in [*unsupported(scene), *repeated_faces(new)]:
+    for sentence in unsupported(scene):
         if sentence not in said:
             said.add(sentence)
             warnings.warn(sentence, RuntimeWarning, stacklevel=2)
