@@ -390,9 +390,7 @@ class _Fit:
         """The mSDF that cuts away what no view sees, if there is such."""
         if self.config.watertight or self.config.unseen_area >= 1:
             return {}
-        closed = LatticeFields.closed(surface["sdf"], self.last_lattice.grid)
-        fields = dataclasses.replace(closed, msdf=surface["msdf"])
-        msdf = without_unseen(self.scene.subject, fields, self.views, self.config.unseen_area)
+        msdf = without_unseen(self.scene.subject, self._fields(surface), self.views, self.config.unseen_area)
         return {} if msdf is None else {"msdf": msdf.numpy()}
 
     def _cuts(self, template: GhostTemplate, moved: np.ndarray) -> list[Cut]:

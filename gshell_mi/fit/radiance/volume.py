@@ -82,7 +82,7 @@ class RadianceVolume:
         self._hull = mi.Texture3f(mi.TensorXf(hull[..., None].astype(np.float32)),
                                   wrap_mode=dr.WrapMode.Clamp)
         self._reach = _OUTSIDE * 2 / len(hull)
-        self._sides = [max(BRICK, round(share * config.volume_side / BRICK) * BRICK) for share in _SIDES]
+        self._sides = _sides(config)
         counts = np.round(np.multiply(_SHARES, config.volume_iterations))
         #: The first step of each level, and the end of all.
         self._begins = [0, *(int(step) for step in np.cumsum(counts))]
@@ -101,7 +101,7 @@ class RadianceVolume:
     @staticmethod
     def first_side(config: FitConfig) -> int:
         """Voxels per side of the first level."""
-        return max(BRICK, round(_SIDES[0] * config.volume_side / BRICK) * BRICK)
+        return _sides(config)[0]
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Which voxels there are, for a run to go on with."""
@@ -257,3 +257,8 @@ class RadianceVolume:
         if self.level:
             kept = dr.opaque(mi.Float, 1 - _DIRECTION_DECAY)
             optimizer["direction"] = kept * dr.detach(optimizer["direction"])
+
+
+def _sides(config: FitConfig) -> list[int]:
+    """Voxels per side of each level, in whole bricks."""
+    return [max(BRICK, round(share * config.volume_side / BRICK) * BRICK) for share in _SIDES]
