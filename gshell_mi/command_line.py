@@ -17,6 +17,7 @@ Arguments = TypeVar("Arguments")
 
 def run_command(name: str, description: str, arguments: type[Arguments], work: Callable[[Arguments], None],
                 given: list[str] | None, *, default: Arguments | None = None,
+                check: Callable[[list[str]], None] = lambda words: None,
                 interrupted: Callable[[Arguments], str] = lambda _: "Interrupted.") -> int:
     """Parses the arguments, sets their Mitsuba variant and does the work.
 
@@ -28,12 +29,14 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
         given: the arguments; None: those of the process.
         default: values of the fields that are not given, in place of the dataclass's own;
             ``tyro.MISSING`` where there is none.
+        check: is called with the words before they are parsed, and may raise a ``UserError``.
         interrupted: what to say after Ctrl-C.
 
     Returns:
         The exit code: 0, 2 after a user's mistake (told on stderr in one sentence), 130 after Ctrl-C.
     """
     def run() -> int:
+        check(sys.argv[1:] if given is None else given)
         parsed = tyro.cli(arguments, args=given, prog=f"python -m gshell_mi.{name}", description=description,
                           config=(tyro.conf.FlagCreatePairsOff,),
                           **({} if default is None else {"default": default}))

@@ -203,6 +203,21 @@ class GShell(mi.Mesh):
         """The watertight template of the present fields, in world space."""
         return self._in_world(extract(self.lattice, **self._fields(), template=True).template)
 
+    def surface_of(self, fields: LatticeFields, *, template: bool = False) -> SurfaceMesh:
+        """The surface of other fields in this shape's place, in world space; the shape stays as it is.
+
+        Args:
+            fields: on any lattice.
+            template: the watertight template instead.
+        """
+        lattice = fields.lattice
+        values = {name: mi.Float(getattr(fields, name)) for name in _FIELDS[:3]}
+        if lattice.weight_count:
+            neutral, given = dr.zeros(mi.Float, lattice.weight_count), fields.weights
+            values["weights"] = neutral if given is None else mi.Float(given)
+        mesh = extract(lattice, **values, template=template)
+        return self._in_world(mesh.template if template else mesh)
+
     @property
     def cell_size(self) -> float:
         """Side of a cell in world units: the cube root of its volume."""

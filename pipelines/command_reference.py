@@ -35,30 +35,38 @@ def reference() -> str:
     for command in COMMANDS:
         module = importlib.import_module(f"gshell_mi.{command}.__main__")
         title = module.__doc__.splitlines()[0].split(": ", 1)[1]
-        rows = ["| argument | default | |", "|---|---|---|", *_rows(module._Arguments)]
         sections.append(f"## `python -m gshell_mi.{command}`\n\n{title[0].upper()}{title[1:]}\n\n"
-                        + "\n".join(rows) + "\n")
+                        + "\n\n".join(_tables(module._Arguments)) + "\n")
     return "\n".join(sections)
 
 
-def _rows(arguments: type) -> list[str]:
-    rows = []
+def _tables(arguments: type, prefix: str = "") -> list[str]:
+    """The arguments of a dataclass as a table, and after it those of the dataclasses nested in it."""
+    rows, nested = ["| argument | default | |", "|---|---|---|"], []
     types = typing.get_type_hints(arguments, include_extras=True)
     texts = field_texts(arguments)
     for field in dataclasses.fields(arguments):
         kind = types[field.name]
         inner = typing.get_args(kind)[0] if typing.get_origin(kind) is typing.Annotated else kind
-        if dataclasses.is_dataclass(inner):
-            rows += _rows(inner)
-            continue
-        name = "--" + field.name.replace("_", "-")
-        metadata = str(getattr(kind, "__metadata__", ""))
-        if "-o" in metadata:
-            name = f"-o, {name}"
-        if "positional" in metadata.lower():
-            name = field.name.upper()
-        rows.append(f"| `{name}` | {_default(field)} | {texts[field.name]} |")
-    return rows
+        if dataclasses.is_dataclass(inner) and field.name == "config":
+            own, *rest = _tables(inner)
+            rows += own.splitlines()[2:]
+            nested += rest
+        elif dataclasses.is_dataclass(inner):
+            table, *_ = _tables(inner, f"{field.name}.")
+            nested += [f"### `--{field.name}`\n\n{inner.__doc__.splitlines()[0]}", table]
+        else:
+            rows.append(_row(field, str(getattr(kind, "__metadata__", "")), prefix, texts[field.name]))
+    return ["\n".join(rows), *nested]
+
+
+def _row(field: dataclasses.Field, metadata: str, prefix: str, text: str) -> str:
+    name = "--" + f"{prefix}{field.name}".replace("_", "-")
+    if "-o" in metadata:
+        name = f"-o, {name}"
+    if "positional" in metadata.lower():
+        name = field.name.upper()
+    return f"| `{name}` | {_default(field)} | {text} |"
 
 
 def _default(field: dataclasses.Field) -> str:
@@ -70,12 +78,14 @@ def _default(field: dataclasses.Field) -> str:
 
 
 def field_texts(arguments: type) -> dict[str, str]:
-    """The docstring under each field."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(arguments))).body[0].body
+    """The docstring under each field; that of a base class where a class only gives another default."""
     texts = {}
-    for statement, following in itertools.pairwise(body):
-        if isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr):
-            texts[statement.target.id] = " ".join(following.value.value.split()).replace("|", "\\|")
+    for kind in reversed([kind for kind in arguments.__mro__ if dataclasses.is_dataclass(kind)]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body
+        for statement, following in itertools.pairwise(body):
+            if (isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr)
+                    and isinstance(following.value, ast.Constant)):
+                texts[statement.target.id] = " ".join(following.value.value.split()).replace("|", "\\|")
     return texts
 
 

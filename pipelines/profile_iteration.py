@@ -28,23 +28,20 @@ _RENDERING = ("render", "render backward")
 def joint_stage(scene: Path, output: Path):
     """The joint stage of a finished fit, as its checkpoint has it."""
     from gshell_mi.fit import FitConfig
-    from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint, restore_optimizer
+    from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+    from gshell_mi.fit.fitted import Fitted
     from gshell_mi.fit.joint.joint import JointStage
-    from gshell_mi.fit.start import fit_lattice, start_fields, start_light, start_material
+    from gshell_mi.fit.lattices import Lattices
+    from gshell_mi.fit.stage import Fit
+    from gshell_mi.fit.surface import Surface
     from gshell_mi.scene import load_fit_scene
 
-    fit = load_fit_scene(scene)
+    loaded = load_fit_scene(scene)
     checkpoint = Checkpoint.load(output / "checkpoint.npz")
-    known = FitConfig.__dataclass_fields__
-    config = FitConfig(**{name: value for name, value in checkpoint.config.items() if name in known})
-    arrays = checkpoint.arrays
-    fields = start_fields(fit.subject, arrays, fit_lattice(fit.subject, config), config)
-    fit.subject.set_fields(fields)
-    material = start_material(fit, arrays, fields.lattice, config)
-    joint = JointStage(fit, material, start_light(fit, arrays, config), config)
-    for name, optimizer in joint.optimizers.items():
-        restore_optimizer(name, optimizer, arrays)
-    return joint
+    config = FitConfig().changed(checkpoint.config)
+    fit = Fit(loaded, config, Lattices.of(loaded.subject, config))
+    fitted = Fitted.of(fit, Surface.from_arrays(checkpoint.arrays))
+    return JointStage(loaded, fitted.material, fitted.light, config)
 
 
 def seconds_per_phase(joint, first: int, count: int,
@@ -85,7 +82,7 @@ def main() -> None:
     given = parser.parse_args()
     ensure_variant(given.variant)
     joint = joint_stage(given.scene, given.output)
-    last = joint.config.iterations
+    last = joint.iterations
     for step in range(last, last + _WARM_UP):
         joint.step(step)
     clock = time.process_time if given.cpu else time.perf_counter

@@ -1,20 +1,28 @@
 """A cup in a printed pattern: its hull is a solid block, as no silhouette shows its inside."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
 
 from gshell_mi.compat import mesh_scene
+from gshell_mi.fields import LatticeFields
 from gshell_mi.fit.config import FitConfig
 from gshell_mi.fit.ghost.pixels import PixelPool
+from gshell_mi.fit.ghost.radiance_ghost import RadianceConfig
+from gshell_mi.fit.stages.cavities import CavitiesConfig
+from gshell_mi.fit.surface import Seen, Surface
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
 
 #: Half the side of the block, how thick the walls are, and the views' pixels per side.
 HALF, WALL, SIZE = 0.6, 0.15, 64
 
-CONFIG = FitConfig(carving_iterations=200, carving_batch=16384, ghost_batch=8192)
+CONFIG = FitConfig(cavities=CavitiesConfig(iterations=200, batch=16384),
+                   radiance=RadianceConfig(batch=8192))
 
 
 def block(low, high) -> trimesh.Trimesh:
@@ -59,6 +67,23 @@ def capture(shape: trimesh.Trimesh | None = None) -> tuple[PinholeViews, PixelPo
         rgba = np.ascontiguousarray(samples.mean(axis=(2, 4)).transpose(1, 2, 0).astype(np.float32))
         targets.append(Target(None, rgba, True))
     return views, PixelPool(views, targets), targets
+
+
+def fit_of(subject: mi.Shape, shape: trimesh.Trimesh, config: FitConfig = CONFIG) -> SimpleNamespace:
+    """What the stages read of a fit of a shape; every sixth view is held out."""
+    views, pixels, targets = capture(shape)
+    held_out = np.arange(len(views)) % 6 == 0
+    training, unseen = (PixelPool(views, targets, np.flatnonzero(chosen)) for chosen in (~held_out, held_out))
+    return SimpleNamespace(scene=SimpleNamespace(subject=subject), views=views, pixels=pixels, config=config,
+                           training=training, held_out=unseen,
+                           cell=lambda surface: surface.lattice.spacing * subject.length_scale)
+
+
+def surface_of(sdf: np.ndarray, msdf: np.ndarray, grid: str = "tet") -> Surface:
+    """A surface that is its own hull, of which nothing was seen."""
+    sdf, msdf = (np.asarray(field, np.float32).ravel() for field in (sdf, msdf))
+    seen = Seen(np.zeros((len(sdf), 3)), np.zeros(len(sdf), bool), np.float32(1))
+    return Surface(replace(LatticeFields.closed(sdf, grid), msdf=msdf), hull=sdf, seen=seen)
 
 
 def hull_of(resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -109,14 +109,14 @@ def interrupted(command: list[str], seconds: float) -> tuple[int, str]:
 def loading() -> float:
     """Seconds that a command needs to load its modules."""
     begin = time.monotonic()
-    subprocess.run([sys.executable, "-c", "import gshell_mi.fit.run"], check=True)
+    subprocess.run([sys.executable, "-c", "import gshell_mi.fit.api"], check=True)
     return time.monotonic() - begin
 
 
 @pytest.mark.parametrize("share", [0.4, 0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0])
 def test_it_works_from_the_first_second_on(bowl_scene, tmp_path, loading, share):
     """At whatever moment: while modules load, while the scene loads, in the fit."""
-    options = ["--ghost-iterations", "100000", "--ghost-batch", "256"]
+    options = ["--openings.iterations", "100000", "--radiance.batch", "256"]
     code, told = interrupted(["gshell_mi.fit", str(bowl_scene), "-o", str(tmp_path / "out"), *options],
                              share * loading)
     assert code == 130, told

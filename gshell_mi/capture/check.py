@@ -231,7 +231,7 @@ def _hull(scene: FitScene, silhouettes: list[Silhouette]) -> mi.Scene | None:
                          np.array([s.camera.center for s in seen]),
                          np.array([s.camera.basis() for s in seen]))
     distance = visual_hull(points, views, [s.possible for s in seen],
-                           daylight_votes=FitConfig().hull_daylight_votes)
+                           daylight_votes=FitConfig().hull.daylight_votes)
     sdf = np.clip(distance.numpy() / np.abs(np.linalg.det(
         np.array(scene.subject.to_world.matrix)[:3, :3])) ** (1 / 3), -1, 1)
     if not (sdf < 0).any():

@@ -2,6 +2,14 @@
 
 from .bookkeeping.observer import Observer, Preview
 from .config import FitConfig
-from .run import FitResult, fit_scene
 
 __all__ = ["FitConfig", "FitResult", "Observer", "Preview", "fit_scene"]
+
+
+def __getattr__(name: str) -> object:
+    # Only who fits a whole scene needs what exports it and reports on it.
+    if name in ("FitResult", "fit_scene"):
+        from . import api
+
+        return getattr(api, name)
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -14,7 +15,8 @@ import tyro
 from ..command_line import run_command
 from ..export import can_resume
 from ..wording import counted
-from .config import FitConfig, default_output
+from .config import EFFORTS, Effort, FitConfig, default_output
+from .flags import check_flags
 
 
 @dataclass(frozen=True)
@@ -32,9 +34,10 @@ class _Arguments:
     overwrite: bool = False
     """Replace an earlier fit in the output folder, once the new one is complete; other files are left
     alone."""
-    preview: bool = False
-    """A rough result in half a minute: a coarser lattice, fewer steps and samples, no refinement, no mesh.glb
-    or report.html. What else is given on the command line still counts."""
+    effort: Effort = "normal"
+    """How much work the fit is. preview is a rough result in half a minute: a coarser lattice, fewer steps
+    and samples, no refinement, no mesh.glb or report.html. thorough takes twice as many steps of every stage.
+    What else is given on the command line still counts."""
     no_report: bool = False
     """Leave out mesh.glb and report.html, which take some seconds."""
     quiet: bool = False
@@ -49,17 +52,25 @@ class _Arguments:
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     words = sys.argv[1:] if arguments is None else arguments
-    default = None
-    if "--preview" in words:  # other defaults, which the rest of the words are parsed against
-        default = _Arguments(scene=tyro.MISSING, config=FitConfig.preview())
+    # Other defaults, which the rest of the words are parsed against.
+    effort = _effort(words)
+    default = _Arguments(scene=tyro.MISSING, effort=effort, config=EFFORTS[effort])
     return run_command("fit", "Reconstruct an open or closed surface, its material and its light.",
-                       _Arguments, _fit, arguments, default=default, interrupted=_how_to_continue)
+                       _Arguments, _fit, arguments, default=default, interrupted=_how_to_continue,
+                       check=check_flags)
+
+
+def _effort(words: list[str]) -> str:
+    """The effort that a command names; what is none is told of when the words are parsed."""
+    named = [following for word, following in itertools.pairwise([*words, ""]) if word == "--effort"]
+    named += [word.removeprefix("--effort=") for word in words if word.startswith("--effort=")]
+    return named[-1] if named and named[-1] in EFFORTS else "normal"
 
 
 def _fit(given: _Arguments) -> None:
     # Only now, as plugins and types exist per variant.
     from ..viewer import Viewer
-    from .run import fit_scene
+    from .api import fit_scene
 
     with ExitStack() as stack:
         viewer = None
@@ -68,7 +79,8 @@ def _fit(given: _Arguments) -> None:
             print(f"live view: {viewer.url}", file=sys.stderr)
         result = fit_scene(given.scene, given.output, targets=given.targets, config=given.config,
                            resume=given.resume, overwrite=given.overwrite,
-                           report=not (given.no_report or given.preview), quiet=given.quiet, observer=viewer)
+                           report=not (given.no_report or given.effort == "preview"), quiet=given.quiet,
+                           observer=viewer)
     counts = result.metrics["counts"]
     print(f"{result.output}: {counts['vertices']} vertices, {counts['faces']} faces, "
           f"{counted(counts['boundary_loops'], 'boundary loop')}, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -13,8 +14,10 @@ from ..compat import mesh_scene
 from ..fields.smoothing import MeshDiffusion
 from ..targets import Target
 from ..views import PinholeViews
-from .config import FitConfig
 from .ghost.pixels import COVERED, PixelPool
+
+if TYPE_CHECKING:
+    from .config import FitConfig
 
 #: Pixels this near to a mask's outline do not judge: where a surface ends to a cell is found later.
 _OUTLINE = 3
@@ -85,7 +88,7 @@ def _errors_by_view(surface: tuple[np.ndarray, np.ndarray], views: PinholeViews,
     rays, errors = (dr.zeros(mi.Float, len(views)) for _ in range(2))
     with dr.suspend_grad():
         for step in range(_LEARNT):
-            sample = known.sample(config.ghost_batch, seed=config.seed, step=step)
+            sample = known.sample(config.radiance.batch, seed=config.seed, step=step)
             whole = sample.alpha > COVERED
             for index, weight, hit in _sides(scene, corners, views.rays(sample.view, sample.film)):
                 for total, value in zip(sums, (*sample.radiance, mi.Float(1)), strict=True):
@@ -94,7 +97,7 @@ def _errors_by_view(surface: tuple[np.ndarray, np.ndarray], views: PinholeViews,
         colors = _means(sums, faces, len(vertices))
         coverage = dr.opaque(mi.Float, 3 * unknown.mask_weight(1.0))
         for step in range(_JUDGED):
-            sample = unknown.sample(config.ghost_batch, seed=config.seed, step=step)
+            sample = unknown.sample(config.radiance.batch, seed=config.seed, step=step)
             radiance, alpha = mi.Color3f(0), mi.Float(0)
             for index, weight, hit in _sides(scene, corners, views.rays(sample.view, sample.film)):
                 radiance += weight * mi.Color3f(*(dr.gather(mi.Float, color, index, hit) for color in colors))

@@ -9,6 +9,7 @@ import numpy as np
 from .. import memory
 from ..fields.thin_parts import thin_part_refinement
 from ..lattice import make_lattice
+from ..parametrisation import parametrisation_named
 from .config import FitConfig
 
 # Bytes, measured on llvm_ad_rgb: peak resident memory of short fits (all stages, a few steps each) with 32 to
@@ -64,21 +65,22 @@ class MemoryEstimate:
         """
         # Fields in blocks follow the surface.
         whole = resolution
-        weights = make_lattice(grid, resolution).weight_count if config.flexicubes_weights else 0
+        moves = parametrisation_named(config.model.field).moves_weights
+        weights = make_lattice(grid, resolution).weight_count if moves else 0
         if resolution >= config.band_resolution and make_lattice(grid, 1).fits_in_blocks:
             whole = min(resolution, config.start_resolution)
             weights = min(weights, _WEIGHTS_PER_SQUARE_CELL * resolution**2)
         vertices = make_lattice(grid, whole).vertex_count
         pixels = np.asarray(sizes, np.int64).prod(axis=1)
-        votes = config.hull_daylight_votes * len(pixels)
+        votes = config.hull.daylight_votes * len(pixels)
         hull_samples = (thin_part_refinement(whole) * whole + 1) ** 3
         return cls(
             program=_PROGRAM + (_ASSET if report else 0),
             hull=int((_PER_HULL_SAMPLE + _PER_VOTE * votes) * hull_samples),
             lattice=_PER_VERTEX * vertices + _PER_SQUARE_CELL * resolution**2 + _PER_WEIGHT * weights,
             targets=_PER_PIXEL * int(pixels.sum()),
-            samples=_PER_SAMPLE * int(pixels.max()) * max(config.primal_spp, config.spp),
-            volume=_PER_SQUARE_VOXEL * config.volume_side**2 if config.volume_iterations else 0)
+            samples=_PER_SAMPLE * int(pixels.max()) * max(config.render.primal_spp, config.render.spp),
+            volume=_PER_SQUARE_VOXEL * config.volume.side**2 if config.volume.iterations else 0)
 
     @property
     def total(self) -> int:
@@ -91,8 +93,9 @@ class MemoryEstimate:
             "hull": "lower --resolution or use fewer views",
             "lattice": "lower --resolution",
             "targets": "use fewer or smaller views (--max-size of the import)",
-            "volume": "lower --volume-side",
-            "samples": "lower --primal-spp and --spp, or use smaller views (--max-size of the import)",
+            "volume": "lower --volume.side",
+            "samples": "lower --render.primal-spp and --render.spp, or use smaller views (--max-size of the "
+                       "import)",
         }
         largest = max(cures, key=lambda name: getattr(self, name))
         share = getattr(self, largest) / memory.GIB

@@ -1,6 +1,8 @@
 """How lattice fields hang on what an optimiser changes."""
 
-from .kinds import PARAMETRISATIONS, make_parametrisation
+from .explicit import ExplicitGrid
+from .kinds import make_parametrisation, parametrisation_named, register_parametrisation
 from .parametrisation import Parametrisation, StepRules
 
-__all__ = ["PARAMETRISATIONS", "Parametrisation", "StepRules", "make_parametrisation"]
+__all__ = ["ExplicitGrid", "Parametrisation", "StepRules", "make_parametrisation", "parametrisation_named",
+           "register_parametrisation"]

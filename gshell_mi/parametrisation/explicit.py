@@ -27,9 +27,15 @@ class ExplicitGrid(Parametrisation):
 
     Args:
         start: fields to start from, any of ``sdf``, ``msdf``, ``deform``, ``weights``.
+        lattice: of the fields.
+        rules: how far a step may go.
+        seed: of nothing here.
     """
 
-    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules):
+    is_explicit = True
+
+    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules,
+                 seed: int = 0):
         self.lattice, self.rules = lattice, rules
         self.optimizer = mi.ad.Adam(lr=rules.rate, uniform=True)
         # What a mean over all pixels says of one vertex may be smaller than the epsilon that is usual.

@@ -48,6 +48,12 @@ class Parametrisation(ABC):
     fitting_steps: int = 0
     """Calls of ``fit_step`` that bring the fields to what they are to start from; 0 if they start there."""
 
+    is_explicit: bool = False
+    """Whether the parameters are the values of the fields themselves."""
+
+    moves_weights: bool = False
+    """Whether the weights of FlexiCubes are among the fields that it is given in a fit."""
+
     held: mi.Bool | None = None
     """Lattice vertices where the mSDF stays as it is; None for none. Heeded where ``replace`` is."""
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 from gshell_mi.errors import UserError
 from gshell_mi.fit import FitConfig
 
 #: Types of the settings whose default is None.
-_OPTIONAL = {"resolution": int, "grid": str}
+_OPTIONAL = {"resolution": int, "grid": str, "refinement.descent": float, "folds.descent": float}
 
 
 def parsed_settings(pairs: list[str]) -> FitConfig:
-    """The configuration that ``["resolution=48", "image_loss=l1"]`` stands for; the rest are defaults.
+    """The configuration that ``["resolution=48", "losses.image=l1"]`` stands for; the rest are defaults.
 
     Raises:
         UserError: no such setting, or a value of another kind than its default.
     """
-    defaults, given = dataclasses.asdict(FitConfig()), {}
+    defaults, given = FitConfig().settings(), {}
     for pair in pairs:
         name, _, text = pair.partition("=")
         if name not in defaults:
@@ -33,18 +32,20 @@ def parsed_settings(pairs: list[str]) -> FitConfig:
         if type(value) is not kind:
             raise UserError(f"The setting '{name}' is a {kind.__name__}, and '{text}' is none.")
         given[name] = value
-    return FitConfig(**given)
+    return FitConfig().changed(given)
 
 
 def as_flags(changes: dict) -> str:
     """Settings as the options of ``python -m gshell_mi.fit``.
 
-    >>> as_flags({"ghost_gain": 0.0, "watertight": True})
-    '--ghost-gain 0 --watertight'
+    >>> as_flags({"openings.gain": 0.0, "watertight": True, "losses.extra": {"eikonal": 0.5}})
+    '--openings.gain 0 --watertight --losses.extra eikonal 0.5'
     """
     words = []
     for name, value in changes.items():
         flag = f"--{name.replace('_', '-')}"
+        if isinstance(value, dict):
+            value = " ".join(f"{key} {number:g}" for key, number in value.items())
         words.append(flag if value is True else f"{flag} {value:g}" if isinstance(value, float)
                      else f"{flag} {value}")
     return " ".join(words)
@@ -52,5 +53,5 @@ def as_flags(changes: dict) -> str:
 
 def non_default(config: FitConfig) -> dict:
     """The settings that are not defaults."""
-    defaults = dataclasses.asdict(FitConfig())
-    return {name: value for name, value in dataclasses.asdict(config).items() if value != defaults[name]}
+    defaults = FitConfig().settings()
+    return {name: value for name, value in config.settings().items() if value != defaults[name]}

@@ -155,7 +155,7 @@ def _same_settings(checkpoint: Path, config: FitConfig) -> bool:
     if not checkpoint.is_file():
         return False
     try:
-        return Checkpoint.load(checkpoint).config == _plain(config)
+        return Checkpoint.load(checkpoint).config == json.loads(json.dumps(config.settings()))
     except UserError:
         return False
 

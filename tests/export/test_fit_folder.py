@@ -18,6 +18,7 @@ from gshell_mi.export.ply import read_ply, write_ply
 from gshell_mi.export.stock_scene import up_axis, write_light, write_scene
 from gshell_mi.fields import LatticeFields, sphere
 from gshell_mi.fit.config import FitConfig
+from gshell_mi.fit.joint.config import RenderConfig
 from gshell_mi.fit.joint.joint import JointStage
 from gshell_mi.lattice import TetLattice
 from gshell_mi.light import EnvironmentLight
@@ -41,7 +42,7 @@ def exported(bowl_scene, tmp_path_factory):
     fit.subject.set_fields(LatticeFields(ball.sdf, 0.3 - position[:, 1], ball.deform))
     material = MaterialField(0.5 + 0.4 * position, roughness=0.3, metallic=0.1)
     radiance = np.random.default_rng(0).uniform(0.2, 2, (8, 16, 3))
-    config = FitConfig(spp=1, primal_spp=1)
+    config = FitConfig(render=RenderConfig(spp=1, primal_spp=1))
     joint = JointStage(fit, material, EnvironmentLight(radiance), config)
     joint.finish()
     metrics = export_fit(output, fit, joint.material, joint.light, len(SHOWN))

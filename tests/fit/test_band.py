@@ -8,19 +8,21 @@ import numpy as np
 import pytest
 from bowl import CLOSED, RADIUS, SHORT
 
-from gshell_mi.fields import LatticeFields
+from gshell_mi.fields import LatticeFields, sphere
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
 from gshell_mi.fit.joint.joint import JointStage
-from gshell_mi.fit.start import start_material
+from gshell_mi.fit.stages.joint import start_material
+from gshell_mi.fit.surface import Seen, Surface
 from gshell_mi.lattice import BlockLattice, TetLattice
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField
 from gshell_mi.scene import load_fit_scene
 
 LATTICE = TetLattice(70)
-CONFIG = FitConfig(spp=1, primal_spp=1, max_depth=2, light_height=4, warmup=0.0, iterations=10)
+CONFIG = FitConfig(iterations=10).changed({"render.spp": 1, "render.primal_spp": 1, "render.max_depth": 2,
+                                           "model.light_height": 4, "joint.warmup": 0.0})
 
 
 @pytest.fixture(scope="module")
@@ -34,19 +36,20 @@ def bowl() -> LatticeFields:
     return replace(closed, msdf=(0.1 - points[:, 1]).astype(np.float32))
 
 
-def stage(fit, fields: LatticeFields, **settings) -> JointStage:
+def stage(fit, fields: LatticeFields, settings: dict | None = None) -> JointStage:
     fit.subject.set_fields(fields)
     material = MaterialField(np.full((fields.lattice.vertex_count, 3), 0.5))
-    return JointStage(fit, material, EnvironmentLight.uniform(4, 1.0), replace(CONFIG, **settings))
+    return JointStage(fit, material, EnvironmentLight.uniform(4, 1.0), CONFIG.changed(settings or {}))
 
 
 def test_a_step_is_that_on_the_whole_lattice(fit):
     """Gradients that are not smoothed do not know how far the lattice goes on."""
-    rough = {"geometry_smoothing": 1e-12, "geometry_detail": 1e-12, "material_gradient_smoothing": 0.0}
+    rough = {"joint.geometry_smoothing": 1e-12, "joint.geometry_detail": 1e-12,
+             "joint.material_smoothing": 0.0}
     dense, stored = bowl(), bowl().in_blocks()
     after = {}
     for name, fields in (("dense", dense), ("stored", stored)):
-        joint = stage(fit, fields, **rough)
+        joint = stage(fit, fields, rough)
         losses = joint.step(0)
         after[name] = losses, {key: optimizer.state[key] for optimizer in joint.optimizers.values()
                                for key in optimizer.keys()}
@@ -95,9 +98,10 @@ def test_material_is_carried_to_a_finer_lattice(fit):
     points = coarse.vertex_positions()
     known = np.abs(np.linalg.norm(points, axis=1) - 0.6) < 0.25
     colors = np.where(known[:, None], 0.5 + 0.2 * points, 0)
-    arrays = {"radiance": colors.astype(np.float32), "known": known, "light": np.float32(1)}
+    seen = Seen(colors.astype(np.float32), known, np.float32(1))
+    surface = Surface(sphere(coarse), seen=seen)
     blocks = BlockLattice.around(LATTICE, lambda p: dr.norm(p) - 0.6, mi.Float)
-    material = start_material(fit, arrays, blocks, replace(CONFIG, even_start=False))
+    material = start_material(fit, surface, blocks, CONFIG.changed({"model.even_start": False}))
     found = material.values()["vertex_color"].numpy().reshape(-1, 3)
     near = np.abs(dr.norm(blocks.points(mi.Float)).numpy() - 0.6) < 0.05
     expected = 0.5 + 0.2 * blocks.points(mi.Float).numpy().T
@@ -109,7 +113,7 @@ def test_a_fit_in_blocks_is_resumed(bowl_scene, tmp_path, monkeypatch):
     output = tmp_path / "out"
     command = [str(bowl_scene), "-o", str(output), "--quiet", *SHORT, *CLOSED, "--resolution", "40",
                "--start-resolution", "16", "--band-resolution", "32", "--checkpoint-seconds", "0",
-               "--iterations", "2", "--detail-iterations", "4"]
+               "--iterations", "2", "--detail.iterations", "4"]
     step = JointStage.step
 
     def stopped(self, iteration):
@@ -118,13 +122,13 @@ def test_a_fit_in_blocks_is_resumed(bowl_scene, tmp_path, monkeypatch):
         return step(self, iteration)
 
     # However long it takes to save one.
-    monkeypatch.setattr("gshell_mi.fit.bookkeeping.bookkeeping._CHECKPOINT_PAUSE", 0)
+    monkeypatch.setattr("gshell_mi.fit.runner._CHECKPOINT_PAUSE", 0)
     monkeypatch.setattr(JointStage, "step", stopped)
     assert main(command) == 130
     monkeypatch.setattr(JointStage, "step", step)
     kept = Checkpoint.load(output / "checkpoint.npz")
     assert (kept.stage, kept.iteration) == ("detail", 2) and len(kept.arrays["sdf"]) == 17**3
-    assert len(kept.arrays["geometry/sdf/value"]) == len(kept.arrays["band/sdf"]) < 41**3
+    assert len(kept.arrays["work/geometry/sdf/value"]) == len(kept.arrays["work/blocks sdf"]) < 41**3
     assert main([*command, "--resume"]) == 0
     assert (output / "mesh.ply").is_file()
     assert main([*command, "--resume"]) == 0

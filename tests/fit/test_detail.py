@@ -1,7 +1,6 @@
 """The detail stage: the joint stage continued on a finer lattice."""
 
 import json
-from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -12,13 +11,15 @@ from gshell_mi.fields import LatticeFields
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.joint.joint import JointStage
-from gshell_mi.fit.start import start_fields, start_light, start_material
+from gshell_mi.fit.stages.joint import DetailConfig, JointConfig, start_fields, start_light, start_material
+from gshell_mi.fit.surface import Seen, Surface
 from gshell_mi.lattice import FlexiCubesLattice
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField
 from gshell_mi.scene import load_fit_scene
 
-CONFIG = FitConfig(spp=1, primal_spp=1, max_depth=2, light_height=4, band_resolution=32)
+CONFIG = FitConfig(band_resolution=32).changed({
+    "render.spp": 1, "render.primal_spp": 1, "render.max_depth": 2, "model.light_height": 4})
 
 
 @pytest.mark.parametrize("resolution", [30, 40], ids=["whole lattice", "blocks"])
@@ -36,10 +37,11 @@ def test_it_starts_with_what_the_joint_stage_has_left(bowl_scene, resolution):
     material = MaterialField(0.5 + 0.2 * points, roughness=0.3, metallic=0.7)
     joint = JointStage(fit, material, light, CONFIG)
     joint.finish()
-    left = joint.outcome() | {"light": np.float32(1)}
+    seen = Seen(np.zeros((len(points), 3)), np.zeros(len(points), bool), np.float32(1))
+    left = Surface(joint.moved_fields(), seen=seen, model=joint.model())
 
     finer = FlexiCubesLattice(resolution)
-    start = start_fields(fit.subject, left, finer, CONFIG)
+    start = start_fields(fit.subject, left, finer, CONFIG.band_resolution, {})
     assert (start.blocks is None) == (resolution < CONFIG.band_resolution)
     fit.subject.set_fields(start)
     vertices = fit.subject.surface.to_numpy()[0]
@@ -58,22 +60,17 @@ def test_it_starts_with_what_the_joint_stage_has_left(bowl_scene, resolution):
 
 
 def test_its_rates_are_those_of_what_has_settled():
-    before = FitConfig(iterations=260, detail_iterations=7)
-    after = before.for_detail()
-    assert (after.iterations, after.warmup, after.color_hold, after.second_look) == (7, 0, 0, 1)
+    before, after = JointConfig(), DetailConfig()
+    assert (after.warmup, after.color_hold, after.revision) == (0, 0, 1)
     assert after.geometry_lr < before.geometry_lr and after.geometry_smoothing < before.geometry_smoothing
     assert after.material_lr < before.material_lr and after.light_lr < before.light_lr
-    assert replace(after, iterations=260, warmup=before.warmup, color_hold=before.color_hold,
-                   second_look=before.second_look, geometry_lr=before.geometry_lr,
-                   geometry_smoothing=before.geometry_smoothing, material_lr=before.material_lr,
-                   light_lr=before.light_lr) == before
 
 
 @pytest.mark.parametrize(("arguments", "stages"), [
-    (("--iterations", "2", "--detail-iterations", "3"), {"joint": 2, "detail": 3}),
-    (("--iterations", "2", "--detail-iterations", "0"), {"joint": 2}),
+    (("--iterations", "2", "--detail.iterations", "3"), {"joint": 2, "detail": 3}),
+    (("--iterations", "2", "--detail.iterations", "0"), {"joint": 2}),
     (("--iterations", "0"), {}),
-    (("--iterations", "2", "--field", "multiresolution"), {"joint": 2}),
+    (("--iterations", "2", "--model.field", "multiresolution"), {"joint": 2}),
     (("--iterations", "2", "--start-resolution", "24"), {"joint": 2}),
 ])
 def test_when_there_is_one(bowl_scene, tmp_path, arguments, stages):

@@ -9,11 +9,12 @@ from bowl import RADIUS, half_sphere
 from scipy.spatial import Delaunay
 
 from gshell_mi.fit import FitConfig
+from gshell_mi.fit.ghost.radiance_ghost import RadianceConfig
 from gshell_mi.fit.judge import Verdict, judge
 from gshell_mi.scene import load_fit_scene
 from gshell_mi.views import PinholeViews
 
-CONFIG = FitConfig(ghost_batch=16384)
+CONFIG = FitConfig(radiance=RadianceConfig(batch=16384))
 
 
 def _bowl() -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,9 @@ from bowl import CLOSED, SHORT
 from gshell_mi import UserError, memory
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
+from gshell_mi.fit.joint.config import RenderConfig
 from gshell_mi.fit.memory import MemoryEstimate
+from gshell_mi.fit.radiance.config import VolumeConfig
 
 SIZES = np.full((48, 2), 256)
 
@@ -22,7 +24,8 @@ def test_targets_grow_with_pixels_and_the_lattice_with_cells():
     assert 4 < fine.lattice / one.lattice < 8, "between the surface and the volume"
     fine, finest = (MemoryEstimate.of(FitConfig(), resolution, SIZES).lattice for resolution in (256, 512))
     assert finest < 4 * fine, "in blocks it follows the surface"
-    assert MemoryEstimate.of(FitConfig(primal_spp=12), 64, SIZES).samples == 2 * one.samples
+    double = FitConfig(render=RenderConfig(primal_spp=12))
+    assert MemoryEstimate.of(double, 64, SIZES).samples == 2 * one.samples
     mixed = np.array([[100, 200], [400, 300]])
     assert MemoryEstimate.of(FitConfig(), 64, mixed).samples == one.samples * 120000 // 256**2
 
@@ -31,9 +34,9 @@ def test_targets_grow_with_pixels_and_the_lattice_with_cells():
     (FitConfig(), 512, SIZES, "lower --resolution"),
     (FitConfig(), 64, np.full((400, 2), 1000), "use fewer or smaller views"),
     (FitConfig(), 64, np.full((400, 2), 64), "lower --resolution or use fewer views"),
-    (FitConfig(primal_spp=512), 64, SIZES, "lower --primal-spp and --spp"),
-    (FitConfig(volume_iterations=0), 16, SIZES[:2], "close other programs"),
-    (FitConfig(), 16, SIZES[:2], "lower --volume-side"),
+    (FitConfig(render=RenderConfig(primal_spp=512)), 64, SIZES, "lower --render.primal-spp and --render.spp"),
+    (FitConfig(volume=VolumeConfig(iterations=0)), 16, SIZES[:2], "close other programs"),
+    (FitConfig(), 16, SIZES[:2], "lower --volume.side"),
 ])
 def test_the_cure_is_for_what_takes_most(config, resolution, sizes, cure):
     estimate = MemoryEstimate.of(config, resolution, sizes)

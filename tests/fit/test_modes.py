@@ -14,6 +14,8 @@ from topology import assert_manifold
 from gshell_mi.compat import triangle_mesh
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit.__main__ import main
+from gshell_mi.fit.joint.joint import JointStage
+from gshell_mi.fit.surface import Surface
 from gshell_mi.lattice import TetLattice
 from gshell_mi.scene import load_fit_scene
 
@@ -82,7 +84,8 @@ def test_geometry_only(scene, tmp_path):
     """A bowl that is too small grows, under the given light and material; no mask tells it to."""
     render_targets_with_the_given_material(scene)
     start_from_sphere(scene, SMALL)
-    metrics = fit(scene, tmp_path / "out", "--geometry-only", "--iterations", "30", "--geometry-lr", "0.4")
+    metrics = fit(scene, tmp_path / "out", "--geometry-only", "--iterations", "30",
+                  "--joint.geometry-lr", "0.4")
     light = np.array(mi.Bitmap(str(tmp_path / "out" / "light.exr")))
     np.testing.assert_allclose(light, 1, rtol=1e-3)
     np.testing.assert_allclose(material(tmp_path / "out")["color_0"], 0.3, atol=1e-6)
@@ -96,13 +99,14 @@ def test_geometry_only(scene, tmp_path):
 def test_geometry_only_shades_faces_flat(scene):
     from gshell_mi.fit import FitConfig
     from gshell_mi.fit.joint.joint import JointStage
-    from gshell_mi.fit.start import start_light, start_material
+    from gshell_mi.fit.stages.joint import start_light, start_material
+    from gshell_mi.fit.surface import Seen, Surface
     loaded = load_fit_scene(scene)
     count = loaded.subject.lattice.vertex_count
-    arrays = {"known": np.zeros(count, bool), "radiance": np.zeros((count, 3)), "light": 1.0}
+    surface = Surface(loaded.subject.fields(), seen=Seen(np.zeros((count, 3)), np.zeros(count, bool), 1.0))
     config = FitConfig(geometry_only=True)
-    assert start_light(loaded, arrays, config) is None
-    joint = JointStage(loaded, start_material(loaded, arrays, loaded.subject.lattice, config), None, config)
+    assert start_light(loaded, surface, config) is None
+    joint = JointStage(loaded, start_material(loaded, surface, loaded.subject.lattice, config), None, config)
     hit = joint.scene.ray_intersect(mi.Ray3f(mi.Point3f([0.1, 0.2], [0.05, 0.1], 3), mi.Vector3f(0, 0, -1)))
     np.testing.assert_allclose(np.array(hit.sh_frame.n), np.array(hit.n), atol=1e-6)
 
@@ -119,24 +123,33 @@ def test_watertight(scene, tmp_path):
     np.testing.assert_array_equal(template.vertices, found.vertices)
     assert template.metadata["_ply_raw"]["vertex"]["data"]["msdf_0"].min() > 0
     stages = {json.loads(line)["stage"] for line in (output / "log.jsonl").read_text().splitlines()}
-    assert stages == {"carving", "refinement", "joint"}
+    assert stages == {"cavities", "refinement", "joint"}
 
 
 def test_watertight_closes_given_openings(scene, tmp_path):
     start_from_sphere(scene, RADIUS)
     metrics = fit(scene, tmp_path / "out", "--watertight", "--iterations", "0",
-                  "--refinement-iterations", "0")
+                  "--refinement.iterations", "0")
     assert metrics["counts"]["boundary_loops"] == 0
 
 
 @pytest.mark.parametrize("weights", [False, True])
-def test_all_modes_at_once_resume(scene, tmp_path, weights):
+def test_all_modes_at_once_resume(scene, tmp_path, weights, monkeypatch):
     """Nothing but sdf, deform and, if asked for, weights is optimised; a checkpoint knows how to go on."""
     output = tmp_path / "out"
-    modes = ("--watertight", "--known-light", "--fixed-material", "--refinement-iterations", "0",
-             *["--flexicubes-weights"] * weights)
-    fit(scene, output, *modes, "--iterations", "2")
+    modes = ("--watertight", "--known-light", "--fixed-material", "--refinement.iterations", "0",
+             *["--model.field", "flexicubes"] * weights, "--iterations", "2")
+    command = [str(scene), "-o", str(output), "--quiet", *SHORT, *modes]
+    with monkeypatch.context() as patch:
+        patch.setattr(JointStage, "finish", _interrupt)
+        assert main(command) == 130
     stored = np.load(output / "checkpoint.npz")
     optimised = {"sdf", "deform", "weights"} if weights else {"sdf", "deform"}
-    assert {name.split("/")[1] for name in stored.files if "/" in name} == optimised
-    fit(scene, output, *modes, "--iterations", "2", "--resume")
+    assert {name.split("/")[2] for name in stored.files if name.count("/") > 1} == optimised
+    fit(scene, output, *modes, "--resume")
+    end = Surface.from_arrays(np.load(output / "checkpoint.npz"))
+    assert (end.fields.weights is not None) == weights and not end.model
+
+
+def _interrupt(self):
+    raise KeyboardInterrupt

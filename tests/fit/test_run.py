@@ -89,19 +89,19 @@ def test_metrics(whole):
     per_view = list(metrics["psnr_per_view"].values())
     assert metrics["psnr_training"] == pytest.approx(np.mean(per_view), abs=1e-2)
     assert metrics["psnr_training"] > 15
-    assert metrics["config"]["ghost_iterations"] == 100 and metrics["config"]["seed"] == 0
+    assert metrics["config"]["openings"]["iterations"] == 100 and metrics["config"]["seed"] == 0
     assert metrics["versions"]["mitsuba"] == mi.__version__
-    assert {"hull", "ghost", "carving", "refinement", "joint", "total"} <= set(metrics["seconds"])
+    assert {"hull", "openings", "cavities", "refinement", "joint", "total"} <= set(metrics["seconds"])
 
 
 @pytest.mark.parametrize(("gain", "kept"), [("0", False), ("1000", True)])
 def test_metrics_say_whether_the_refinement_was_kept(bowl_scene, tmp_path, gain, kept):
-    assert fit(bowl_scene, tmp_path / "out", *CLOSED, "--iterations", "0", "--refinement-gain", gain) == 0
+    assert fit(bowl_scene, tmp_path / "out", *CLOSED, "--iterations", "0", "--refinement.gain", gain) == 0
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["refinement_kept"] is kept
 
 
 def test_log_has_a_line_per_step(whole):
-    counts = {"ghost": 100, "carving": 10, "refinement": 8, "joint": 12}
+    counts = {"openings": 100, "cavities": 10, "refinement": 8, "joint": 12}
     assert steps(whole) == [(stage, i) for stage, count in counts.items() for i in range(count)]
     losses = [json.loads(line)["image"] for line in (whole / "log.jsonl").read_text().splitlines()]
     assert np.mean(losses[90:100]) < 0.8 * np.mean(losses[:10]), "the ghost learns"
@@ -135,7 +135,7 @@ def test_without_alpha(bowl_scene, tmp_path, capfd):
         pixels = np.array(mi.Bitmap(str(path)))
         mi.Bitmap(np.ascontiguousarray(pixels[..., :3])).write(str(path))
     # No mask holds the template against the black around the object: openings have to be justified.
-    options = [*SHORT, "--ghost-iterations", "40", "--ghost-gain", "0.8", "--iterations", "2"]
+    options = [*SHORT, "--openings.iterations", "40", "--openings.gain", "0.8", "--iterations", "2"]
     assert main([str(scene), "-o", str(tmp_path / "out"), *options]) == 0
     told = " ".join(capfd.readouterr().err.split())
     assert "warning: some targets have no alpha: coverage is taken as 1 and the mask losses are off." in told
@@ -176,16 +176,16 @@ def test_reads_the_reference_only_for_missing_targets(tmp_path, monkeypatch):
 
 
 def test_interrupted_by_the_user(bowl_scene, tmp_path):
-    output, options = tmp_path / "out", (*CLOSED, "--ghost-iterations", "30", "--iterations", "1")
+    output, options = tmp_path / "out", (*CLOSED, "--openings.iterations", "30", "--iterations", "1")
     process = start(bowl_scene, output, "--checkpoint-seconds", "0", *options)
-    wait_for_step(process, output, "ghost", 5)
+    wait_for_step(process, output, "openings", 5)
     process.send_signal(signal.SIGINT)
     _, told = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "continue with --resume" in told and "Traceback" not in told
     assert not list(output.glob(".*")) and (output / "checkpoint.npz").is_file()
     assert fit(bowl_scene, output, "--resume", *options) == 0
-    counts = {"ghost": 30, "carving": 4, "refinement": 2, "joint": 1}
+    counts = {"openings": 30, "cavities": 4, "refinement": 2, "joint": 1}
     assert steps(output) == [(stage, i) for stage, count in counts.items() for i in range(count)]
 
 
@@ -193,9 +193,9 @@ def test_interrupted_by_the_user(bowl_scene, tmp_path):
 def test_killed_and_resumed(bowl_scene, tmp_path):
     """Killed once in each stage, the fit takes the steps that it would have taken."""
     # Which vertices a second look opens is a choice, and rounding alone leads to another one.
-    whole, killed, options = tmp_path / "whole", tmp_path / "killed", ("--second-look", "1")
+    whole, killed, options = tmp_path / "whole", tmp_path / "killed", ("--joint.revision", "1")
     assert fit(bowl_scene, whole, *options) == 0
-    for stage, iteration, resume in (("ghost", 30, ()), ("carving", 5, ("--resume",)),
+    for stage, iteration, resume in (("openings", 30, ()), ("cavities", 5, ("--resume",)),
                                      ("refinement", 3, ("--resume",)), ("joint", 1, ("--resume",))):
         process = start(bowl_scene, killed, "--checkpoint-seconds", "0.05", *options, *resume)
         wait_for_step(process, killed, stage, iteration)
@@ -210,7 +210,7 @@ def test_killed_and_resumed(bowl_scene, tmp_path):
     # gradient. Where vertices move, differences grow tenfold with every step. Two whole runs agree to 1e-5
     # before; to 2 % in the refinement; in the joint stage to 1e-4 at first, a few per cent at the end.
     expected, found = (np.array([step["loss"] for step in log(output)]) for output in (whole, killed))
-    tolerance = {"ghost": 1e-3, "carving": 1e-3, "refinement": 0.06, "joint": 0.2}
+    tolerance = {"openings": 1e-3, "cavities": 1e-3, "refinement": 0.06, "joint": 0.2}
     allowed = [1e-3 if stage == "joint" and iteration <= 2 else tolerance[stage]
                for stage, iteration in steps(whole)]
     np.testing.assert_array_less(np.abs(found / expected - 1), allowed)
@@ -233,16 +233,16 @@ def test_overwriting_keeps_the_earlier_fit_until_the_new_one_is_there(bowl_scene
     assert fit(bowl_scene, output, *options) == 0
     (output / "views" / "holiday.jpg").write_text("mine")
     before = {path: path.read_bytes() for path in output.rglob("*.*")}
-    longer = (*CLOSED, "--ghost-iterations", "30", "--iterations", "1")
+    longer = (*CLOSED, "--openings.iterations", "30", "--iterations", "1")
     assert fit(bowl_scene, output, *longer) == 2
     process = start(bowl_scene, output, "--checkpoint-seconds", "0", "--overwrite", *longer)
-    wait_for_step(process, output / ".unfinished", "ghost", 5)
+    wait_for_step(process, output / ".unfinished", "openings", 5)
     assert fit(bowl_scene, output, "--resume", *longer) == 2, "another run is writing there"
     process.kill()
     process.communicate()
     assert {path: path.read_bytes() for path in before} == before
     assert fit(bowl_scene, output, "--resume", *longer) == 0
-    counts = {"ghost": 30, "carving": 4, "refinement": 2, "joint": 1}
+    counts = {"openings": 30, "cavities": 4, "refinement": 2, "joint": 1}
     assert steps(output) == [(stage, i) for stage, count in counts.items() for i in range(count)]
     assert (output / "views" / "holiday.jpg").read_text() == "mine" and not list(output.glob(".*"))
     assert {path.relative_to(output) for path in output.rglob("*.*")} == {
@@ -251,8 +251,8 @@ def test_overwriting_keeps_the_earlier_fit_until_the_new_one_is_there(bowl_scene
 
 def test_a_volume_is_judged(bowl_scene, tmp_path):
     output = tmp_path / "out"
-    options = (*CLOSED, "--iterations", "2", "--volume-iterations", "30", "--volume-side", "32",
-               "--volume-batch", "4096", "--resolution", "20", "--checkpoint-seconds", "0")
+    options = (*CLOSED, "--iterations", "2", "--volume.iterations", "30", "--volume.side", "32",
+               "--volume.batch", "4096", "--resolution", "20", "--checkpoint-seconds", "0")
     assert fit(bowl_scene, output, *options) == 0
     metrics = json.loads((output / "metrics.json").read_text())
     assert metrics["volume"]["noise"] > 0

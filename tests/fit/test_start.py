@@ -5,7 +5,7 @@ import pytest
 
 from gshell_mi.fields import sphere
 from gshell_mi.fit import FitConfig
-from gshell_mi.fit.start import fit_lattice
+from gshell_mi.fit.lattices import last_lattice
 from gshell_mi.lattice import CubeLattice, FlexiCubesLattice, TetLattice
 
 
@@ -17,10 +17,10 @@ from gshell_mi.lattice import CubeLattice, FlexiCubesLattice, TetLattice
 ])
 def test_what_the_scene_leaves_open_is_chosen(shape, settings, expected):
     subject = mi.load_dict({"type": "gshell", "resolution": 12, **shape})
-    assert fit_lattice(subject, FitConfig(**settings)) == expected
+    assert last_lattice(subject, FitConfig(**settings)) == expected
 
 
 def test_given_fields_keep_their_lattice(tmp_path):
     sphere(TetLattice(12)).save(tmp_path / "fields.npz")
     subject = mi.load_dict({"type": "gshell", "filename": str(tmp_path / "fields.npz")})
-    assert fit_lattice(subject, FitConfig()) == TetLattice(12)
+    assert last_lattice(subject, FitConfig()) == TetLattice(12)

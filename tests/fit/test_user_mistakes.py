@@ -16,6 +16,8 @@ from gshell_mi.errors import UserError
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+from gshell_mi.fit.flags import RENAMED
+from gshell_mi.fit.stages.openings import Openings
 from gshell_mi.own_folder import OwnFolder
 
 
@@ -212,8 +214,9 @@ def test_unknown_variant(told):
 
 
 @pytest.mark.parametrize(("option", "value"), [
-    ("--spp", "0"), ("--ghost-batch", "0"), ("--iterations", "-1"), ("--max-depth", "1"), ("--warmup", "1.5"),
-    ("--resolution", "0"), ("--checkpoint-seconds", "-1"), ("--eikonal", "-1"), ("--light-grey", "-0.1"),
+    ("--render.spp", "0"), ("--radiance.batch", "0"), ("--iterations", "-1"), ("--render.max-depth", "1"),
+    ("--joint.warmup", "1.5"),
+    ("--resolution", "0"), ("--checkpoint-seconds", "-1"), ("--losses.light-grey", "-0.1"),
 ])
 def test_setting_out_of_range(told, option, value):
     assert option.strip("-").replace("-", " ").split()[-1] in told(option, value)
@@ -227,23 +230,46 @@ def test_no_material_to_keep(told, scene, mode):
 
 def test_every_number_has_its_bounds():
     """NaN, infinity and negative numbers make no sense anywhere; 0 switches off or is refused."""
-    numbers = {name: value for name, value in vars(FitConfig(resolution=64)).items()
+    numbers = {name: value for name, value in FitConfig(resolution=64).settings().items()
                if isinstance(value, int | float) and not isinstance(value, bool)}
     assert len(numbers) > 50
     for name, value in numbers.items():
-        flag = f"--{name.replace('_', '-')} "
         impossible = [-1] if isinstance(value, int) else [-0.1, np.nan, np.inf]
         for wrong in impossible:
-            with pytest.raises(UserError, match=f"^{flag}must be"):
-                FitConfig(**{name: wrong})
+            with pytest.raises(UserError, match=f"^--{name.replace('_', '-')} must be"):
+                FitConfig().changed({name: wrong})
+
+
+@pytest.mark.parametrize("words", [("eikonal", "-1"), ("eikonal", "nan")])
+def test_weights_of_further_losses_have_theirs(told, words):
+    assert "--losses.extra eikonal must be" in told("--losses.extra", *words)
+
+
+def test_a_loss_that_there_is_not(told):
+    words = "There is no loss 'tea' for --losses.extra; there are albedo_chroma,"
+    assert words in told("--losses.extra", "tea", "1")
+
+
+@pytest.mark.parametrize("old", sorted(RENAMED))
+def test_flags_of_earlier_versions_are_told_the_new_name(old, capfd):
+    assert main(["scene.xml", f"--{old}", "1"]) == 2
+    told = capfd.readouterr().err.strip()
+    assert told == f"error: --{old} is called --{RENAMED[old]} now; --help lists all settings."
+
+
+def test_the_new_names_are_settings():
+    names = {name.replace("_", "-") for name in FitConfig().settings()} | {"effort"}
+    found = {new.split(" ")[0].replace("no-", "") for new in RENAMED.values()}
+    assert found <= names and len(RENAMED) > 80
+    assert not RENAMED.keys() & names, "what is called so still is no old name"
 
 
 def test_smoothing_and_rates_of_0_switch_off(bowl_scene, tmp_path):
-    off = [word for name in ("ghost-smoothing", "refinement-smoothing", "refinement-lr",
-                             "refinement-radiance-lr", "geometry-smoothing", "geometry-detail", "geometry-lr",
-                             "deform-lr", "material-gradient-smoothing", "material-lr", "light-lr",
-                             "checkpoint-seconds", "hull-daylight-votes", "ghost-min-area", "warmup",
-                             "color-hold")
+    off = [word for name in ("radiance.smoothing", "refinement.smoothing", "refinement.lr",
+                             "refinement.radiance-lr", "joint.geometry-smoothing", "joint.geometry-detail",
+                             "joint.geometry-lr", "joint.deform-lr", "joint.material-smoothing",
+                             "joint.material-lr", "joint.light-lr", "checkpoint-seconds",
+                             "hull.daylight-votes", "min-area", "joint.warmup", "joint.color-hold")
            for word in (f"--{name}", "0")]
     assert main([str(bowl_scene), "-o", str(tmp_path), *SHORT, *CLOSED, "--iterations", "3", *off]) == 0
     losses = [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
@@ -251,9 +277,9 @@ def test_smoothing_and_rates_of_0_switch_off(bowl_scene, tmp_path):
 
 
 def test_no_surface_left(told, scene, tmp_path):
-    sentence = told(*CLOSED, "--refinement-iterations", "0", "--warmup", "0", "--hole-opening", "1e6",
-                    "--geometry-lr", "2", whole=True)
-    assert "has left no surface; start again with --overwrite and a smaller --geometry-lr" in sentence
+    sentence = told(*CLOSED, "--refinement.iterations", "0", "--joint.warmup", "0", "--losses.extra",
+                    "hole_opening", "1e6", "--joint.geometry-lr", "2", whole=True)
+    assert "has left no surface; start again with --overwrite and a smaller --joint.geometry-lr" in sentence
     output = tmp_path / "out"
     assert Checkpoint.load(output / "checkpoint.npz").stage == "joint", "nothing is lost"
     assert not (output / "metrics.json").exists() and not list(output.glob(".*"))
@@ -267,7 +293,7 @@ def test_given_fields_without_a_surface(told, scene):
 
 
 def test_nothing_opaque(told, monkeypatch):
-    monkeypatch.setattr("gshell_mi.fit.ghost.rounds.close_unjustified", lambda logits, *_: -abs(logits))
+    monkeypatch.setattr("gshell_mi.fit.stages.openings.close_unjustified", lambda logits, *_: -abs(logits))
     assert "nothing opaque" in told(whole=True)
 
 
@@ -364,15 +390,13 @@ def test_resume_without_checkpoint(told):
 @pytest.fixture
 def stopped(scene, tmp_path, monkeypatch) -> Path:
     """The folder of a fit that was interrupted after its first stage."""
-    from gshell_mi.fit import run
-
     with monkeypatch.context() as patch:
-        patch.setattr(run._Fit, "_ghost", _interrupt)
+        patch.setattr(Openings, "run", _interrupt)
         assert main([str(scene), "-o", str(tmp_path / "out"), *SHORT]) == 130
     return tmp_path / "out"
 
 
-def _interrupt(self):
+def _interrupt(*_):
     raise KeyboardInterrupt
 
 
@@ -382,7 +406,7 @@ def test_interrupt_says_how_to_go_on(scene, stopped, capfd):
 
 
 def test_resume_with_other_settings(told, stopped):
-    assert "was made with max_depth = 2, not 3" in told("--resume", "--max-depth", "3")
+    assert "was made with render.max_depth = 2, not 3" in told("--resume", "--render.max-depth", "3")
 
 
 @pytest.mark.parametrize(("old", "new", "words"), [
@@ -425,18 +449,18 @@ def test_resume_with_a_copy_elsewhere(scene, stopped, tmp_path):
     change(copy, "<shape", "<!-- the same --> <shape")
     options = ["--targets", str(tmp_path / "copy" / "bowl"), "--resume"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gshell_mi.fit.run._Fit._ghost", _interrupt)
+        patch.setattr(Openings, "run", _interrupt)
         assert main([str(copy), "-o", str(stopped), *SHORT, *options]) == 130
 
 
 @pytest.mark.parametrize("damage", [
     b"garbage\n", b"\n", b"\0\0\0\n", b"5\n", b'{"stage": "tea"}\n', b"\xff\xfe\n", b"{}",
-    b'{"stage": "ghost", "iteration": "1"}\n', b"[" * 9000 + b"\n"])
+    b'{"stage": "openings", "iteration": "1"}\n', b"[" * 9000 + b"\n"])
 def test_a_damaged_log_is_no_reason_to_stop(scene, stopped, damage):
     (stopped / "log.jsonl").write_bytes(damage)
-    assert main([str(scene), "-o", str(stopped), *SHORT, "--ghost-iterations", "1", "--resume"]) == 2
+    assert main([str(scene), "-o", str(stopped), *SHORT, "--openings.iterations", "1", "--resume"]) == 2
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gshell_mi.fit.run._Fit._ghost", _interrupt)
+        patch.setattr(Openings, "run", _interrupt)
         assert main([str(scene), "-o", str(stopped), *SHORT, "--resume"]) == 130
     assert (stopped / "log.jsonl").read_bytes() == b""
 

@@ -9,9 +9,11 @@ from pathlib import Path
 import pytest
 from bowl import CLOSED, SHORT, sensors_xml, write_scene
 
+from gshell_mi import extras  # noqa: F401 registers losses
 from gshell_mi.errors import UserError
 from gshell_mi.evaluation.mesh_scores import mesh_scores
 from gshell_mi.fit import FitConfig
+from gshell_mi.fit.joint.regularisers import registered_losses
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 sys.path.insert(0, str(PIPELINES))
@@ -63,20 +65,26 @@ def test_every_row_changes_what_it_says_and_is_accepted():
 
 def test_the_rows_switch_every_loss():
     default = FitConfig()
-    weights = {name for name, text in field_texts(FitConfig).items()
+    stages = {stage: config for stage, config in vars(default).items() if dataclasses.is_dataclass(config)}
+    weights = {f"{stage}.{name}" for stage, config in stages.items()
+               for name, text in field_texts(type(config)).items()
                if text.startswith(("Weight", "Final weight"))}
+    settings = default.settings()
     switched = {name for row in ROWS for name, value in row.changes.items()
-                if name in weights and (value == 0) == (getattr(default, name) > 0)}
+                if name in weights and (value == 0) == (settings[name] > 0)}
     # Those two need another grid, and depth maps.
-    assert switched == weights - {"flexicubes_deviation", "joint_depth"}
+    assert switched == weights - {"losses.flexicubes_deviation", "losses.depth"}
+    extra = {name for row in ROWS for name in row.changes.get("losses.extra", {})}
+    assert extra == set(registered_losses()) - set(vars(default.losses))
 
 
 def test_settings_as_text():
-    config = parsed_settings(["resolution=48", "grid=bcc", "ghost_gain=1", "image_loss=l1",
+    config = parsed_settings(["resolution=48", "grid=bcc", "openings.gain=1", "losses.image=l1",
                               "watertight=true"])
-    assert config == FitConfig(resolution=48, grid="bcc", ghost_gain=1.0, image_loss="l1", watertight=True)
-    assert as_flags(non_default(config)) == ("--resolution 48 --grid bcc --watertight --ghost-gain 1 "
-                                             "--image-loss l1")
+    assert config == FitConfig(resolution=48, grid="bcc", watertight=True).changed(
+        {"openings.gain": 1.0, "losses.image": "l1"})
+    assert as_flags(non_default(config)) == ("--resolution 48 --grid bcc --watertight --openings.gain 1 "
+                                             "--losses.image l1")
 
 
 @pytest.mark.parametrize(("pair", "complaint"), [
@@ -129,7 +137,7 @@ def test_fits_scores_and_does_neither_twice(scene, tmp_path, capsys, monkeypatch
     assert told[1].startswith("1/2 bowl, default: loops ") and "left]" in told[1]
     assert told[2].startswith("2/2 bowl, no-mask: ") and "about 0:00:00 left" in told[2]
     page = (tmp_path / "page.md").read_text()
-    assert "## bowl" in page and "| mask `--joint-mask 0` |" in page
+    assert "## bowl" in page and "| mask `--losses.mask 0` |" in page
     assert "`--resolution" not in page and "--iterations 2" in page, "shared settings are named"
     assert "Not measured: another seed;" in page
 

@@ -11,6 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "pipelines"))
 import profile_iteration
 
 from gshell_mi.fit import FitConfig
+from gshell_mi.fit.joint.config import ModelConfig, RenderConfig
 from gshell_mi.fit.joint.joint import JointStage
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField
@@ -21,7 +22,8 @@ def test_phases_of_a_step(bowl_scene):
     fit = load_fit_scene(bowl_scene)
     material = MaterialField(np.full((fit.subject.lattice.vertex_count, 3), 0.5))
     joint = JointStage(fit, material, EnvironmentLight.uniform(4, 1.0),
-                       FitConfig(iterations=10, spp=1, primal_spp=1, max_depth=2, light_height=4))
+                       FitConfig(iterations=10, render=RenderConfig(spp=1, primal_spp=1, max_depth=2),
+                                 model=ModelConfig(light_height=4)))
     seconds, free = profile_iteration.seconds_per_phase(joint, 2, 1, iter(range(1000)).__next__)
     assert set(seconds) == {"extraction", "scene update", "render", "losses", "backward", "render backward",
                             "optimiser"}
@@ -33,7 +35,7 @@ def test_goes_on_from_a_finished_fit(bowl_scene, tmp_path):
 
     assert main([str(bowl_scene), "-o", str(tmp_path), "--quiet", *SHORT, *CLOSED]) == 0
     joint = profile_iteration.joint_stage(bowl_scene, tmp_path)
-    assert joint.config.iterations == 12 and joint.step(12)["psnr"] > 20
+    assert joint.iterations == 12 and joint.step(12)["psnr"] > 20
 
 
 def test_table():

@@ -18,10 +18,10 @@ from ...errors import UserError
 from ...files import replacing
 
 #: Raised when the meaning of the arrays changes.
-FORMAT = 4
+FORMAT = 5
 
-#: The stages of a fit, in their order.
-STAGES = ("hull", "ghost", "carving", "refinement", "folds", "volume", "field", "joint", "detail", "done")
+#: What comes after the last stage.
+DONE = "done"
 
 
 @dataclass
@@ -29,7 +29,7 @@ class Checkpoint:
     """Where a fit stands.
 
     Attributes:
-        stage: name of the stage that is running or next.
+        stage: name of the stage that is running or next; empty before the first, ``DONE`` after the last.
         iteration: its steps that are done.
         arrays: everything else, by name.
         seconds: time spent per stage so far.
@@ -43,8 +43,14 @@ class Checkpoint:
     config: dict
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
-    facts: dict[str, bool] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
     inputs: dict[str, Any] = field(default_factory=dict)
+
+    def part(self, prefix: str) -> dict[str, np.ndarray]:
+        """The arrays whose names have a prefix, without it."""
+        found = {name.removeprefix(prefix): array for name, array in self.arrays.items()
+                 if name.startswith(prefix)}
+        return _Arrays(found, self.arrays.path) if isinstance(self.arrays, _Arrays) else found
 
     def save(self, path: Path) -> None:
         """Writes the file beside its place and moves it there in one step.
@@ -95,10 +101,10 @@ class _Arrays(dict):
 
     def __init__(self, arrays: Mapping[str, np.ndarray], path: Path):
         super().__init__(arrays)
-        self._path = path
+        self.path = path
 
     def __missing__(self, name: str) -> np.ndarray:
-        raise _damaged(self._path, f"it lacks '{name}'")
+        raise _damaged(self.path, f"it lacks '{name}'")
 
 
 def _damaged(path: Path, why: str) -> UserError:
@@ -129,7 +135,7 @@ def _problem(header: dict, arrays: dict[str, np.ndarray]) -> str | None:
     for name, kind in kinds.items():
         if type(header[name]) is not kind:
             return f"'{name}' is no {kind.__name__}"
-    if header["stage"] not in STAGES or header["iteration"] < 0:
+    if not header["stage"] or header["iteration"] < 0:
         return "its header names no step of a fit"
     if not all(type(value) in (int, float) for value in header["seconds"].values()):
         return "'seconds' are no numbers"

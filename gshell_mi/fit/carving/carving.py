@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 
 import drjit as dr
@@ -10,16 +10,16 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ...lattice import Lattice
 from ...topology import topology
 from ...triangles import positive_part
 from ..ghost.ghost_template import GhostTemplate, ghost_template
 from ..ghost.justified import close_unjustified
 from ..ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
-from ..ghost.pixels import PixelPool
 from ..ghost.radiance_ghost import RadianceGhost
+from ..stage import Fit
+from ..surface import Seen, Surface
 from .fitted_ghost import fitted_ghost, ray_errors
-from .hollows import SEEN, carved_fields, hollows
+from .hollows import SEEN, hollowed, hollows
 from .radiance_volume import RadianceVolume
 
 #: A hollow is kept if the error of rays that see into it falls below this fraction.
@@ -38,36 +38,34 @@ _CERTAIN = 3.0
 _ERROR_STEPS = 20
 
 
-def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, volume: RadianceVolume,
-          known: PixelPool, unknown: PixelPool) -> dict[str, np.ndarray] | None:
-    """Hollows out a template as far as unseen views are explained better.
+def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
+    """Hollows out a template as far as held-out views are explained better.
 
     Args:
-        subject: the gshell shape; it is left with other fields.
-        state: ``sdf``, ``hull`` and ``msdf`` on the lattice.
-        lattice: whose vertices make a cube.
+        fit: the views.
+        surface: with its hull, on a lattice whose vertices make a cube.
         volume: trained.
-        known, unknown: pixels to fit the radiance of both templates to, and those that judge them.
 
     Returns:
-        ``sdf``, ``hull``, ``msdf``, ``radiance`` (n, 3) and ``known`` (n,) on the lattice; None if there is
-        no hollow, none helps, or the surface would get other boundary loops.
+        The hollowed surface and what was seen of it; None if there is no hollow, none helps, or the surface
+        would get other boundary loops.
     """
+    subject, lattice, min_area = fit.scene.subject, surface.lattice, fit.config.min_area
     shape = (lattice.stride,) * 3
     opacity, seen = volume.opacity(), volume.seen()
-    distance = hollows(*(state[name].reshape(shape) / lattice.spacing for name in ("hull", "msdf")),
-                       opacity, seen)
+    in_cells = (field.reshape(shape) / lattice.spacing for field in (surface.hull, surface.fields.msdf))
+    distance = hollows(*in_cells, opacity, seen)
     if distance is None:
         return None
-    carved = carved_fields(state, distance, lattice.spacing)
-    if not (carved["sdf"] < 0).any():
+    carved = hollowed(surface, distance)
+    if not (carved.fields.sdf < 0).any():
         return None
-    before = ghost_template(subject, state, lattice)
-    after = ghost_template(subject, carved, lattice, like=before)
+    before = ghost_template(subject, surface)
+    after = ghost_template(subject, carved, like=before)
     label, count = ndimage.label(distance > 0, np.ones((3, 3, 3)))
     label = np.where(label, label, ndimage.maximum_filter(label, size=3))
-    ghosts = [fitted_ghost(template, volume.views, known, volume.config) for template in (before, after)]
-    errors = _errors_in_hollows(*ghosts, label, count, volume, unknown, lattice.spacing)
+    ghosts = [fitted_ghost(template, fit) for template in (before, after)]
+    errors = _errors_in_hollows(*ghosts, label, count, volume, fit, lattice.spacing)
     kept = errors[1] < _GAIN * errors[0]
     if not kept[1:].any():
         return None
@@ -75,29 +73,28 @@ def carve(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, 
         # Vertices beside a hollow belong to it.
         owner = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
         distance = np.where(kept[label[tuple(owner)]], distance, -np.inf)
-        carved = carved_fields(state, distance, lattice.spacing)
-        after = ghost_template(subject, carved, lattice, like=before)
-        ghosts[1] = fitted_ghost(after, volume.views, known, volume.config)
-    clean = partial(clean_opacity, vertices=after.vertices, faces=after.faces,
-                    min_area=volume.config.ghost_min_area)
+        carved = hollowed(surface, distance)
+        after = ghost_template(subject, carved, like=before)
+        ghosts[1] = fitted_ghost(after, fit)
+    clean = partial(clean_opacity, vertices=after.vertices, faces=after.faces, min_area=min_area)
     cleaned = clean(after.logits)
     was, became = (topology(*positive_part(template.vertices, template.faces, logits))
                    for template, logits in ((before, before.logits), (after, cleaned)))
     if became.boundary_loops != was.boundary_loops or became.components > was.components:
         return None
-    if not volume.config.watertight:
+    if not fit.config.watertight:
         # Now that what lies behind is in its place, the images may justify more openings.
         proposed = clean(np.where(_in_empty_space(after, volume, opacity, seen), -_CERTAIN, cleaned))
-        ghost = RadianceGhost(after.start, after.faces, volume.views, known, volume.config)
+        ghost = RadianceGhost(after.start, after.faces, fit.views, fit.training, fit.config.radiance,
+                              seed=fit.config.seed)
         ghost.refit_anew(proposed > 0)
-        justified = close_unjustified(proposed, after.faces, ghost.image_error, volume.config.ghost_gain)
+        justified = close_unjustified(proposed, after.faces, ghost.image_error, volume.config.opening_gain)
         # Those that there were have been judged, and a close call may come out otherwise now.
         cleaned = clean(np.where(cleaned > 0, justified, proposed))
     radiance, found = splat_to_lattice(mi.Float(ghosts[1].radiance()[0].ravel()), after.mesh, lattice)
-    msdf = without_specks(msdf_from_template(cleaned, after.mesh, lattice), after.mesh, lattice,
-                          volume.config.ghost_min_area)
-    return carved | {"msdf": msdf.numpy(), "radiance": radiance.numpy().reshape(-1, 3),
-                     "known": found.numpy()}
+    msdf = without_specks(msdf_from_template(cleaned, after.mesh, lattice), after.mesh, lattice, min_area)
+    seen = Seen(radiance.numpy().reshape(-1, 3), found.numpy(), surface.seen.light)
+    return replace(carved.with_fields(msdf=msdf.numpy()), seen=seen)
 
 
 def _in_empty_space(template: GhostTemplate, volume: RadianceVolume, opacity: np.ndarray,
@@ -111,7 +108,7 @@ def _in_empty_space(template: GhostTemplate, volume: RadianceVolume, opacity: np
 
 
 def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.ndarray, count: int,
-                       volume: RadianceVolume, pixels: PixelPool, spacing: float) -> np.ndarray:
+                       volume: RadianceVolume, fit: Fit, spacing: float) -> np.ndarray:
     """(2, count + 1) sums of both ghosts' errors over rays that see into each hollow, or through it.
 
     Rays that find nothing any more count by where they enter, and by their coverage: a hollow must leave the
@@ -119,11 +116,11 @@ def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.nd
     """
     labels, side = mi.UInt32(label.ravel().astype(np.uint32)), dr.opaque(mi.UInt32, len(label))
     sums = [dr.zeros(mi.Float, count + 1) for _ in range(2)]
-    config = volume.config
+    config = fit.config
     with dr.suspend_grad():
         for step in range(_ERROR_STEPS):
-            sample = pixels.sample(config.ghost_batch, seed=config.seed, step=step)
-            ray = volume.views.rays(sample.view, sample.film)
+            sample = fit.held_out.sample(config.radiance.batch, seed=config.seed, step=step)
+            ray = fit.views.rays(sample.view, sample.film)
             near, far = (ghost.scene.ray_intersect_preliminary(ray, coherent=False)
                          for ghost in (before, after))
             # On a GPU, a kernel traces rays in one scene only.
@@ -136,7 +133,7 @@ def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.nd
             x, y, z = mi.Vector3u(dr.clip(dr.round((end + 1) / spacing), 0, mi.Float(side - 1)))
             hollow = dr.gather(mi.UInt32, labels, x + side * (y + side * z), deeper)
             for ghost, total in zip((before, after), sums, strict=True):
-                error = ray_errors(ghost, ray, sample, pixels)
+                error = ray_errors(ghost, ray, sample, fit.held_out)
                 dr.scatter_reduce(dr.ReduceOp.Add, total, error, hollow, deeper)
             dr.eval(sums)
     return np.stack([total.numpy() for total in sums])

@@ -6,17 +6,24 @@ import drjit as dr
 import mitsuba as mi
 
 from ... import losses
-from ...views import PinholeViews
-from ..config import FitConfig
 from ..ghost.ghost_template import GhostTemplate
 from ..ghost.pixels import PixelPool, PixelSample
-from ..ghost.radiance_ghost import RadianceGhost
+from ..ghost.radiance_ghost import RadianceConfig, RadianceGhost
+from ..stage import Fit
 
 
-def fitted_ghost(template: GhostTemplate, views: PinholeViews, pixels: PixelPool, config: FitConfig,
+def fitted_ghost(template: GhostTemplate, fit: Fit, config: RadianceConfig | None = None,
                  **rounds: int) -> RadianceGhost:
-    """A glossy ghost, its radiance fitted to ``pixels`` from grey; ``rounds`` as of its ``refit_anew``."""
-    ghost = RadianceGhost(template.start, template.faces, views, pixels, config, glossy=True)
+    """A glossy ghost, its radiance fitted to the training views from grey.
+
+    Args:
+        template: what it is on.
+        fit: the views.
+        config: in place of the fit's.
+        rounds: as of ``RadianceGhost.refit_anew``.
+    """
+    ghost = RadianceGhost(template.start, template.faces, fit.views, fit.training,
+                          config or fit.config.radiance, seed=fit.config.seed, glossy=True)
     ghost.refit_anew(template.solid, **rounds)
     return ghost
 

@@ -8,12 +8,14 @@ what is opaque (Boykov and Kolmogorov, ICCV 2003).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from ..surface import Surface
 
 #: Optical depth per cell at which a cut costs 1 / e of what it does in empty space, and the least cost.
 _DEPTH, _LEAST = 0.4, 0.03
@@ -67,18 +69,16 @@ def hollows(hull: np.ndarray, msdf: np.ndarray, opacity: np.ndarray, seen: np.nd
     return np.where(near, ndimage.gaussian_filter(distance, _DISTANCE_BLUR), -np.inf)
 
 
-def carved_fields(state: Mapping[str, np.ndarray], distance: np.ndarray,
-                  spacing: float) -> dict[str, np.ndarray]:
-    """``sdf``, ``hull`` and ``msdf`` of a template without the hollows.
+def hollowed(surface: Surface, distance: np.ndarray) -> Surface:
+    """A surface without hollows.
 
     Args:
-        state: the same of the template with them.
+        surface: with its hull.
         distance: signed distances to the hollows, in cells, positive inside.
-        spacing: of the lattice.
     """
-    fields = {name: np.maximum(state[name], spacing * distance.ravel()).astype(np.float32)
-              for name in ("sdf", "hull")}
-    return fields | {"msdf": state["msdf"]}
+    deep = surface.lattice.spacing * distance.ravel()
+    sdf, hull = (np.maximum(field, deep).astype(np.float32) for field in (surface.fields.sdf, surface.hull))
+    return replace(surface.with_fields(sdf=sdf), hull=hull)
 
 
 def _minimum_cut(inside: np.ndarray, lid: np.ndarray, opacity: np.ndarray, hidden: np.ndarray) -> np.ndarray:

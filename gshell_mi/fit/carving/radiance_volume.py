@@ -9,6 +9,8 @@ what it wants to see, and stays.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -19,10 +21,12 @@ from ...compat import mesh_scene
 from ...images import decibels
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
-from ..config import FitConfig
 from ..ghost.contrast import Contrast
 from ..ghost.pixels import PixelPool
 from ..lanes import chosen_lanes
+
+if TYPE_CHECKING:
+    from ..stages.cavities import CavitiesConfig
 
 #: Length of a step along a ray, in cells.
 _STEP = 0.5
@@ -59,18 +63,20 @@ class RadianceVolume:
         to_world: from the cube to the world.
         views: the cameras.
         pixels: the targets' pixels.
-        config: ``carving_*`` fields.
+        config: how it is trained.
         first: the step to begin with; that of a resumed run.
+        seed: of the random pixels.
     """
 
     def __init__(self, hull: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
-                 to_world: mi.ScalarTransform4f, views: PinholeViews, pixels: PixelPool, config: FitConfig,
-                 first: int = 0):
+                 to_world: mi.ScalarTransform4f, views: PinholeViews, pixels: PixelPool,
+                 config: CavitiesConfig, first: int = 0, *, seed: int = 0):
         self.hull, self.views, self.pixels, self.config = hull, views, pixels, config
+        self.seed = seed
         self.hull_surface = vertices, faces
         self.to_lattice = mi.Transform4f(to_world).inverse()
         self.scene = mesh_scene(vertices, faces)
-        self.coarse_steps = round(_COARSE_STEPS * config.carving_iterations)
+        self.coarse_steps = round(_COARSE_STEPS * config.iterations)
         self.mean_radiance = pixels.mean_radiance()
         self._tone = Contrast(self.mean_radiance)
         #: By name; another one after the coarse steps.
@@ -84,11 +90,11 @@ class RadianceVolume:
         if iteration >= self.coarse_steps and self.resolution < full:
             self._refine(full)
         fine = self.resolution == full
-        begin, end = (self.coarse_steps, config.carving_iterations) if fine else (0, self.coarse_steps)
+        begin, end = (self.coarse_steps, config.iterations) if fine else (0, self.coarse_steps)
         decay = (0.1 if fine else 0.5) ** ((iteration - begin) / max(end - begin, 1))
         optimizer = self.optimizers["volume"]
-        optimizer.set_learning_rate({"density": decay * config.carving_lr,
-                                     "radiance": decay * config.carving_radiance_lr * self.mean_radiance})
+        optimizer.set_learning_rate({"density": decay * config.lr,
+                                     "radiance": decay * config.radiance_lr * self.mean_radiance})
         rays, target, alpha = self._rays(iteration)
         radiance, transmittance = self._march(rays, iteration)
         dr.eval(radiance, transmittance)
@@ -145,7 +151,7 @@ class RadianceVolume:
             radiance = np.full((*allowed.shape, 3), self.mean_radiance)
         density = np.where(allowed, density, _EMPTY)
         self._allowed = mi.Float(allowed.ravel().astype(np.float32))
-        optimizer = mi.ad.Adam(lr=self.config.carving_lr, beta_2=0.99)
+        optimizer = mi.ad.Adam(lr=self.config.lr, beta_2=0.99)
         optimizer["density"] = mi.Float(density.ravel().astype(np.float32))
         optimizer["radiance"] = mi.Float(radiance.ravel().astype(np.float32))
         self.optimizers["volume"] = optimizer
@@ -167,7 +173,7 @@ class RadianceVolume:
     def _rays(self, step: int) -> tuple[tuple, mi.Color3f, mi.Float]:
         """Random pixels' rays that meet the hull: origins, directions, first and last distance on the
         lattice; and the targets' radiance and coverage."""
-        sample = self.pixels.sample(self.config.carving_batch, seed=self.config.seed, step=step)
+        sample = self.pixels.sample(self.config.batch, seed=self.seed, step=step)
         ray = self.views.rays(sample.view, sample.film)
         hit = self.scene.ray_intersect_preliminary(ray, coherent=False)
         values = ray.o, ray.d, hit.t, sample.radiance, sample.alpha

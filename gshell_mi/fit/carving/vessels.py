@@ -10,7 +10,7 @@ so one thickness tells, and only for a vessel is it varied, as is the hollow's d
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -19,16 +19,14 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from ...lattice import Lattice
 from ...topology import equal_patches
-from ...views import PinholeViews
-from ..config import FitConfig
 from ..ghost.ghost_template import GhostTemplate, ghost_template
 from ..ghost.opening import msdf_from_template, splat_to_lattice
-from ..ghost.pixels import PixelPool
 from ..ghost.radiance_ghost import RadianceGhost
+from ..stage import Fit
+from ..surface import Seen, Surface
 from .fitted_ghost import fitted_ghost, ray_errors
-from .hollows import carved_fields
+from .hollows import hollowed
 
 #: Thickness of a wall, in cells, that tells vessels; those that are tried for them then.
 _TELLING, _THINNER, _THICKER = 2.5, (1.5,), (4.0, 6.0, 9.0)
@@ -50,34 +48,28 @@ _ENOUGH, _ERROR_STEPS = 100, 20
 _CERTAIN = 3.0
 
 
-def hollowed_vessels(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice,
-                     views: PinholeViews, known: PixelPool, unknown: PixelPool,
-                     config: FitConfig) -> dict[str, np.ndarray] | None:
-    """Hollows a template out behind openings where that explains unseen views much better.
+def hollowed_vessels(fit: Fit, surface: Surface, gain: float) -> Surface | None:
+    """Hollows a template out behind openings where that explains held-out views much better.
 
     Args:
-        subject: the gshell shape; it is left with other fields.
-        state: ``sdf``, ``hull`` and ``msdf`` on the lattice.
-        lattice: whose vertices make a cube.
-        known, unknown: pixels to fit the radiance of templates to, and those that judge them.
-        config: ``vessel_gain`` and what concerns the ghost.
+        fit: the views.
+        surface: with its hull, on a lattice whose vertices make a cube.
+        gain: fraction of the error without a wall below which a wall is one; 0 tries none.
 
     Returns:
-        ``sdf``, ``hull``, ``msdf``, ``radiance`` (n, 3) and ``known`` (n,) on the lattice; None if no opening
-        leads into a hollow.
+        The hollowed surface and what was seen of it; None if no opening leads into a hollow.
     """
-    template = ghost_template(subject, state, lattice)
-    if template.solid.all() or not template.solid.any() or not config.vessel_gain:
+    template = ghost_template(fit.scene.subject, surface)
+    if template.solid.all() or not template.solid.any() or not gain:
         return None
-    trials = _Trials(subject, state, lattice, template, views, known, unknown, config)
-    vessel = trials.best()
+    vessel = _Trials(fit, surface, template, gain).best()
     if vessel is None:
         return None
-    carved, radiance = vessel.template, vessel.ghost.radiance()[0]
-    radiance, found = splat_to_lattice(mi.Float(radiance.ravel()), carved.mesh, lattice)
+    carved, lattice = vessel.template, surface.lattice
+    radiance, found = splat_to_lattice(mi.Float(vessel.ghost.radiance()[0].ravel()), carved.mesh, lattice)
     msdf = msdf_from_template(carved.logits, carved.mesh, lattice)
-    return vessel.fields | {"msdf": msdf.numpy(), "radiance": radiance.numpy().reshape(-1, 3),
-                            "known": found.numpy()}
+    seen = Seen(radiance.numpy().reshape(-1, 3), found.numpy(), surface.seen.light)
+    return replace(vessel.surface.with_fields(msdf=msdf.numpy()), seen=seen)
 
 
 @dataclass(frozen=True)
@@ -104,14 +96,14 @@ class _Vessel:
     """A template with a hollow, on trial.
 
     Attributes:
-        fields: what it comes from, but for the openings that are none.
+        surface: what it comes from, but for the openings that are none.
         template: without the openings into the hollow.
         ghost: fitted to it.
         errors: (V,) of rays, by the vertex of the template without the hollow that they meet first.
     """
 
     hollow: _Hollow
-    fields: dict[str, np.ndarray]
+    surface: Surface
     template: GhostTemplate
     ghost: RadianceGhost
     errors: np.ndarray
@@ -125,14 +117,13 @@ class _Vessel:
 class _Trials:
     """Tries hollows behind the openings of a template; arguments as of ``hollowed_vessels``."""
 
-    def __init__(self, subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice,
-                 template: GhostTemplate, views: PinholeViews, known: PixelPool, unknown: PixelPool,
-                 config: FitConfig):
-        self.subject, self.state, self.lattice, self.template = subject, state, lattice, template
-        self.views, self.known, self.unknown = views, known, unknown
-        self.config = replace(config, ghost_batch=max(round(_BATCH * config.ghost_batch), 1))
-        points = mi.Transform4f(subject.to_world) @ lattice.points(mi.Float)
-        self._inside = state["hull"] < 0
+    def __init__(self, fit: Fit, surface: Surface, template: GhostTemplate, gain: float):
+        self.fit, self.surface, self.template, self.gain = fit, surface, template, gain
+        self.lattice = surface.lattice
+        batch = max(round(_BATCH * fit.config.radiance.batch), 1)
+        self.config = replace(fit.config.radiance, batch=batch)
+        points = mi.Transform4f(fit.scene.subject.to_world) @ self.lattice.points(mi.Float)
+        self._inside = surface.hull < 0
         self._points = points.numpy().T[self._inside]
         self._sheet = self._fitted(template)
 
@@ -146,7 +137,7 @@ class _Trials:
         before, rays = self._errors(self._sheet)
         error, was, enough = (np.bincount(space[opened], values[opened], space.max() + 1)
                               for values in (first.errors, before, rays))
-        hollow = (error < self.config.vessel_gain * was) & (enough >= _ENOUGH)
+        hollow = (error < self.gain * was) & (enough >= _ENOUGH)
         mouth = opened & hollow[space]
         if not mouth.any():
             return None
@@ -175,15 +166,15 @@ class _Trials:
         hollow = self._hollow(mouth, thickness, depth)
         if hollow is None:
             return None
-        fields = carved_fields(self.state, hollow.distance, self.lattice.spacing)
+        surface = hollowed(self.surface, hollow.distance)
         closed = replace(self.template, logits=np.where(mouth, _CERTAIN, self.template.logits))
-        carved = ghost_template(self.subject, fields, self.lattice, like=closed)
+        carved = ghost_template(self.fit.scene.subject, surface, like=closed)
         ghost = self._fitted(carved)
-        return _Vessel(hollow, fields, carved, ghost, self._errors(ghost)[0])
+        return _Vessel(hollow, surface, carved, ghost, self._errors(ghost)[0])
 
     def _hollow(self, mouth: np.ndarray, thickness: float, depth: float) -> _Hollow | None:
         """What lies behind openings and deeper than a wall; None if that is nothing."""
-        vertices, cell = self.template.vertices, self.subject.cell_size
+        vertices, cell = self.template.vertices, self.fit.cell(self.surface)
         to_wall, to_mouth = (cKDTree(vertices[chosen]).query(self._points)[0] / cell
                              for chosen in (~mouth, mouth))
         # The wall ends at the opening's rim.
@@ -208,17 +199,17 @@ class _Trials:
         return _Hollow(mouth, thickness, to_mouth[inside].max(), distance, votes.argmax(axis=1)[opening])
 
     def _fitted(self, template: GhostTemplate) -> RadianceGhost:
-        return fitted_ghost(template, self.views, self.known, self.config, rounds=_ROUNDS)
+        return fitted_ghost(template, self.fit, self.config, rounds=_ROUNDS)
 
     def _errors(self, ghost: RadianceGhost) -> tuple[np.ndarray, np.ndarray]:
         """(V,) sums of a ghost's errors, and numbers of rays, by the vertex that these meet first."""
-        pixels, config = self.unknown, self.config
+        pixels, seed = self.fit.held_out, self.fit.config.seed
         errors, rays = (dr.zeros(mi.Float, len(self.template.vertices)) for _ in range(2))
         vertex = mi.UInt32(self.template.faces[:, 0].astype(np.uint32))
         with dr.suspend_grad():
             for step in range(_ERROR_STEPS):
-                sample = pixels.sample(config.ghost_batch, seed=config.seed, step=step)
-                ray = self.views.rays(sample.view, sample.film)
+                sample = pixels.sample(self.config.batch, seed=seed, step=step)
+                ray = self.fit.views.rays(sample.view, sample.film)
                 hit = self._sheet.scene.ray_intersect_preliminary(ray, coherent=False)
                 # On a GPU, a kernel traces rays in one scene only.
                 dr.eval(hit)

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from ...conversion.solid_distance import solid_distance
 from ...fields import LatticeFields
 from ...fields.smoothing import MeshDiffusion
+from ...lattice import Lattice
 from ...topology import PINHOLE, Topology, boundary_edges, topology
 from ...triangles import positive_part
 from ..ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
@@ -54,13 +55,14 @@ _RIM = 2.0
 _FRACTIONS = (1.0, 0.7, 0.4)
 
 
-def recast(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, logits: np.ndarray,
-           radiance: np.ndarray, min_area: float, wanted: Topology,
+def recast(subject: mi.Shape, lattice: Lattice, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray,
+           logits: np.ndarray, radiance: np.ndarray, min_area: float, wanted: Topology,
            fewest_loops: int | None = None) -> dict[str, np.ndarray] | None:
     """Fields whose surface is the moved template's, with its openings.
 
     Args:
-        subject: the gshell shape; it is left with these fields.
+        subject: the gshell shape, whose place the fields are in.
+        lattice: of the fields.
         vertices, moved: (V, 3) world positions of the template's vertices before and after.
         faces: (F, 3) of the template.
         logits: (V,) surface where positive, open elsewhere.
@@ -79,15 +81,15 @@ def recast(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: np
     fewest_loops = wanted.boundary_loops if fewest_loops is None else fewest_loops
     for fraction in _FRACTIONS:
         placed = vertices + fraction * (moved - vertices)
-        fields = _fields(subject, vertices, placed, faces, logits, radiance, min_area)
+        fields = _fields(subject, lattice, vertices, placed, faces, logits, radiance, min_area)
         if fields is None:
             continue
-        closed = LatticeFields.closed(fields["sdf"], subject.lattice.grid)
-        subject.set_fields(dataclasses.replace(closed, msdf=fields["msdf"]))
-        surface_vertices, surface_faces, _ = subject.surface.to_numpy()
+        closed = LatticeFields.closed(fields["sdf"], lattice.grid)
+        surface = subject.surface_of(dataclasses.replace(closed, msdf=fields["msdf"]))
+        surface_vertices, surface_faces, _ = surface.to_numpy()
         found = topology(surface_vertices, surface_faces)
         torn = is_torn(surface_vertices, surface_faces, *positive_part(placed, faces, logits),
-                       _RIM * subject.cell_size)
+                       _RIM * lattice.spacing * subject.length_scale)
         if found.boundary_loops >= fewest_loops and found.components <= wanted.components and not torn:
             if found.pinholes <= wanted.pinholes:
                 return fields
@@ -96,17 +98,16 @@ def recast(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: np
     return nearly
 
 
-def _fields(subject: mi.Shape, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, logits: np.ndarray,
-            radiance: np.ndarray, min_area: float) -> dict[str, np.ndarray] | None:
-    lattice, solid = subject.lattice, logits > 0
+def _fields(subject: mi.Shape, lattice: Lattice, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray,
+            logits: np.ndarray, radiance: np.ndarray, min_area: float) -> dict[str, np.ndarray] | None:
+    solid = logits > 0
     to_lattice = np.linalg.inv(np.array(subject.to_world.matrix, np.float64))
     before, local = (points @ to_lattice[:3, :3].T + to_lattice[:3, 3] for points in (vertices, moved))
     # A reflection turns the template inside out.
     local_faces = faces[:, ::-1] if np.linalg.det(to_lattice[:3, :3]) < 0 else faces
     local = thickened(before, local, local_faces, solid, lattice.spacing)
     sdf = solid_distance(local, local_faces, solid, lattice)
-    subject.set_fields(LatticeFields.closed(sdf, lattice.grid))
-    template = subject.template()
+    template = subject.surface_of(LatticeFields.closed(sdf, lattice.grid), template=True)
     if template.is_empty:
         return None
     new_vertices, new_faces, _ = template.to_numpy()

@@ -29,27 +29,26 @@ def recut(subject: mi.Shape, coarse: LatticeFields, fine: LatticeFields) -> Latt
     """Fine fields that are open where the coarse ones are.
 
     Args:
-        subject: the gshell shape; what it is left with is of no account.
+        subject: the gshell shape, in whose place both are.
         coarse: any fields.
         fine: the same on a finer lattice, all of it or blocks.
     """
     if (coarse.msdf > 0).all() or not (coarse.sdf < 0).any():
         return fine
-    subject.set_fields(coarse)
-    vertices, faces, _, values = _template(subject)
-    reach = _REACH * subject.cell_size
-    subject.set_fields(fine)
-    fine_vertices, fine_faces, template, found = _template(subject)
+    reach = _REACH * coarse.lattice.spacing * subject.length_scale
+    vertices, faces, _, values = _template(subject, coarse)
+    fine_vertices, fine_faces, template, found = _template(subject, fine)
     wanted = values_nearby(vertices, faces, values[:, None], fine_vertices, fine_faces, reach)[:, 0]
     changed, (edges, _) = (wanted > 0) != (found > 0), mesh_edges(fine_faces)
     for _ in range(_AROUND):
         changed = spread(changed, edges)
-    msdf = rewritten(mi.Float(fine.msdf), wanted, changed, template, subject.lattice)
+    msdf = rewritten(mi.Float(fine.msdf), wanted, changed, template, fine.lattice)
     return dataclasses.replace(fine, msdf=msdf.numpy())
 
 
-def _template(subject: mi.Shape) -> tuple[np.ndarray, np.ndarray, SurfaceMesh, np.ndarray]:
+def _template(subject: mi.Shape,
+              fields: LatticeFields) -> tuple[np.ndarray, np.ndarray, SurfaceMesh, np.ndarray]:
     """Vertices (V, 3) and faces (F, 3) of a template, the template, and the mSDF (V,) at its vertices."""
-    template = subject.template()
+    template = subject.surface_of(fields, template=True)
     vertices, faces, _ = template.to_numpy()
-    return vertices, faces, template, template.interpolate(mi.Float(subject.fields().msdf)).numpy()
+    return vertices, faces, template, template.interpolate(mi.Float(fields.msdf)).numpy()

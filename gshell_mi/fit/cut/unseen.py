@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -25,16 +24,17 @@ def without_unseen(subject: mi.Shape, fields: LatticeFields, views: PinholeViews
     """The mSDF that also cuts away what no view sees from either side; None if that is little.
 
     Args:
-        subject: the gshell shape; it is left with the fields.
+        subject: the gshell shape, in whose place the surface is.
         fields: of the surface.
         views: the cameras.
         min_area: what is connected and smaller than this fraction of the template's area stays: between
             views, and in folds, there is always something that none of them sees.
     """
-    subject.set_fields(fields)
-    template, (vertices, faces, _) = subject.template(), subject.surface.to_numpy()
+    template = subject.surface_of(fields, template=True)
+    vertices, faces, _ = subject.surface_of(fields).to_numpy()
+    lattice, msdf = fields.lattice, mi.Float(fields.msdf)
     places, cells, _ = template.to_numpy()
-    values = template.interpolate(subject.msdf).numpy()
+    values = template.interpolate(msdf).numpy()
     centers, normals = places[cells].mean(axis=1), unit(area_vectors(places, cells))
     known = np.zeros(len(places), bool)
     known[cells[best_view(centers, normals, (vertices, faces), views) > _GRAZING]] = True
@@ -43,5 +43,5 @@ def without_unseen(subject: mi.Shape, fields: LatticeFields, views: PinholeViews
     if not unseen.any():
         return None
     smooth = MeshDiffusion(cells, len(places), _SMOOTHING)
-    cut, near = reopened(values, (values <= 0) | unseen, smooth, subject.lattice.spacing)
-    return rewritten(dr.detach(subject.msdf), cut, near, template, subject.lattice)
+    cut, near = reopened(values, (values <= 0) | unseen, smooth, lattice.spacing)
+    return rewritten(msdf, cut, near, template, lattice)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -13,6 +12,7 @@ from ...extraction.surface_mesh import SurfaceMesh
 from ...fields import LatticeFields
 from ...fields.thin_parts import back_on_solid
 from ...lattice import Lattice
+from ..surface import Surface
 
 #: A template takes its opacity from another one that is at most this many cells away ...
 _REACH = 1.5
@@ -50,31 +50,31 @@ def closed_template(subject: mi.Shape, sdf: np.ndarray,
     """The template that is where ``sdf`` changes sign, its vertices (V, 3) and its faces (F, 3).
 
     Args:
-        subject: the gshell shape; it is left with this field, closed, whatever it had before.
+        subject: the gshell shape, in whose place it is.
         sdf: at the vertices of ``lattice``.
         lattice: need not be the shape's own.
     """
-    subject.set_fields(LatticeFields.closed(sdf, lattice.grid))
-    mesh = subject.template()
+    mesh = subject.surface_of(LatticeFields.closed(sdf, lattice.grid), template=True)
     vertices, faces, _ = mesh.to_numpy()
     return mesh, vertices, faces
 
 
-def ghost_template(subject: mi.Shape, state: Mapping[str, np.ndarray], lattice: Lattice, *,
+def ghost_template(subject: mi.Shape, surface: Surface, *,
                    like: GhostTemplate | None = None) -> GhostTemplate:
     """Extracts a template from lattice fields.
 
     Args:
-        subject: the gshell shape; it is left with these fields, as of ``closed_template``.
-        lattice: of the fields.
-        state: ``sdf``, ``hull`` (the sdf before thin parts were grown) and ``msdf``.
+        subject: the gshell shape, in whose place it is.
+        surface: with its hull. Offsets of the lattice's vertices are left out.
         like: a template before a change of shape, whose opacity the new one takes over. New parts are solid.
     """
-    mesh, vertices, faces = closed_template(subject, state["sdf"], lattice)
-    logits, excess = (mesh.interpolate(mi.Float(state[name])).numpy() for name in ("msdf", "hull"))
+    lattice, fields = surface.lattice, surface.fields
+    mesh, vertices, faces = closed_template(subject, fields.sdf, lattice)
+    logits, excess = (mesh.interpolate(mi.Float(field)).numpy() for field in (fields.msdf, surface.hull))
     logits = logits / lattice.spacing
     if like is not None:
         distance, nearest = cKDTree(like.vertices).query(vertices)
-        logits = np.where(distance < _REACH * subject.cell_size, like.logits[nearest], _CERTAIN)
+        near = distance < _REACH * lattice.spacing * subject.length_scale
+        logits = np.where(near, like.logits[nearest], _CERTAIN)
     start = back_on_solid(vertices, faces, np.where(logits > 0, subject.length_scale * excess, 0))
     return GhostTemplate(mesh, vertices, faces, logits, start)

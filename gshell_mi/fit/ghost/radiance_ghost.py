@@ -10,6 +10,10 @@ material, nothing can be traded for scale or shading, and a path tracer's noise 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,16 +22,14 @@ from ... import losses
 from ...activations import inverse_softplus, sigmoid, softplus
 from ...compat import mesh_scene, move_mesh
 from ...fields.smoothing import MeshDiffusion
-from ...images import decibels
-from ...means import mean
-from ...schedules import decay_at
 from ...views import PinholeViews
+from ..bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
 from ..bookkeeping.observer import Preview
-from ..config import FitConfig
+from ..bounds import Between
 from .contrast import Contrast
 from .glossy_lobe import PER_SIDE, SHARED, initial_lobe, mirrored_radiance
 from .mesh_normals import vertex_normals
-from .pixels import COVERED, FAINT, PixelPool, PixelSample
+from .pixels import COVERED, PixelPool, PixelSample
 from .sheets import Sheet, trace_sheets
 
 #: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
@@ -55,6 +57,21 @@ _EXTRA_STEP = 1 << 20
 #: The lobe learns slower than the radiance by this factor: it is to explain what that cannot.
 _LOBE_RATE = 0.4
 
+
+@dataclass(frozen=True)
+class RadianceConfig:
+    """Radiance and opacity of a template, by which the stages up to the refinement judge."""
+
+    batch: Annotated[int, Between(1)] = 65536
+    """Pixels per step over all views, of which those far from the masks are left out."""
+    layers: Annotated[int, Between(1)] = 4
+    """Layers of the template that a ray composites."""
+    lr: float = 0.1
+    """Adam's step for opacity logits and radiance."""
+    smoothing: float = 2.0
+    """Lambda of the Sobolev gradient (I + lambda L)^-1 on the template."""
+
+
 class RadianceGhost:
     """Opacity and two-sided radiance on a fixed mesh, trained on random pixels of all views.
 
@@ -63,23 +80,25 @@ class RadianceGhost:
         faces: (F, 3) vertex indices, oriented outwards.
         views: the cameras.
         pixels: the targets' pixels.
-        config: ``ghost_*`` fields.
+        config: how it is fitted.
+        seed: of the random pixels.
         glossy: adds the lobe, for shapes. Openings are told apart better without: it explains a little of
             everything, hence also of what is seen through a cap.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: PinholeViews, pixels: PixelPool,
-                 config: FitConfig, *, glossy: bool = False):
+                 config: RadianceConfig, *, seed: int = 0, glossy: bool = False):
         self.views, self.pixels, self.config, self.glossy = views, pixels, config, glossy
+        self.seed = seed
         self.vertex_count = len(vertices)
         self._positions = mi.Float(vertices.ravel().astype(np.float32))
         self._faces = mi.Vector3u(faces.T.astype(np.uint32))
         self.scene = mesh_scene(vertices, faces)
         self._offset = 1e-4 * float(np.ptp(vertices, axis=0).max())
-        self._smooth = MeshDiffusion(faces, self.vertex_count, config.ghost_smoothing)
-        self._tone = Contrast(pixels.mean_radiance())
+        self._smooth = MeshDiffusion(faces, self.vertex_count, config.smoothing)
+        self.tone = Contrast(pixels.mean_radiance())
         grey = inverse_softplus(pixels.mean_radiance())
-        self.optimizer = mi.ad.Adam(lr=config.ghost_lr)
+        self.optimizer = mi.ad.Adam(lr=config.lr)
         #: (V, 2, 3): of the front and the back of every vertex.
         self.optimizer["radiance"] = dr.full(mi.Float, grey, 6 * self.vertex_count)
         if glossy:
@@ -88,34 +107,6 @@ class RadianceGhost:
             self._normals = self._smooth_normals()
         self._set_opacity(np.full(self.vertex_count, _INITIAL_LOGIT))
         self._opacity_rests = False
-
-    def step(self, iteration: int) -> dict[str, float]:
-        """One Adam step on a batch of random pixels; returns the losses."""
-        config, optimizer = self.config, self.optimizer
-        progress = iteration / config.ghost_iterations
-        sample, radiance, alpha, _ = self._render(iteration)
-        share = self.pixels.share
-        image = share * losses.l1(self._tone(radiance), self._tone(sample.radiance))
-        mask = share * losses.mask_l2(alpha, sample.alpha)
-        # Where a mask shows daylight within the hull, every sheet on the ray is open: no doubt, no balance.
-        daylight = share * losses.mask_l2(dr.select(sample.alpha < FAINT, alpha, 0), 0)
-        opacity = sigmoid(optimizer["opacity"])
-        front, back = (softplus(side) for side in self._sides())
-        # Undecided opacity must have its say first; only then is it made to decide.
-        late = dr.opaque(mi.Float, max(0.0, 2 * progress - 1))
-        total = (
-            image
-            + self.pixels.mask_weight(config.ghost_mask) * mask
-            + self.pixels.mask_weight(config.ghost_daylight) * daylight
-            + late * config.ghost_binary * losses.binary_entropy_bound(opacity)
-            + late * config.ghost_closing * losses.transparency(opacity)
-            + config.ghost_chroma * losses.chroma_difference(front, back)
-        )
-        dr.backward(total)
-        self.update(("opacity", "radiance"), config.ghost_lr * decay_at(progress))
-        error = share * mean(dr.square(dr.detach(radiance) - sample.radiance))
-        return {"loss": total[0], "image": image[0], "mask": mask[0],
-                "psnr": decibels(error[0])}
 
     def begin_again(self, opaque: np.ndarray, opened: np.ndarray) -> None:
         """Before all steps once more, with the radiance of now. The vertices ``opaque`` (V,) and ``opened``
@@ -135,12 +126,12 @@ class RadianceGhost:
         self._set_opacity(np.where(opaque, _CERTAIN_LOGIT, -_CERTAIN_LOGIT))
         self._opacity_rests = True
         for step in range(_REFIT_STEPS):
-            sample, radiance, _, sheets = self._render(_EXTRA_STEP + step)
+            sample, radiance, _, sheets = self.render(_EXTRA_STEP + step)
             # What is left of a template may be too small for any ray to meet.
             if not sheets:
                 continue
-            dr.backward(losses.l1(self._tone(radiance), self._tone(sample.radiance)))
-            self.update(("radiance",), self.config.ghost_lr)
+            dr.backward(losses.l1(self.tone(radiance), self.tone(sample.radiance)))
+            self.update(("radiance",), self.config.lr)
 
     def image_error(self, opaque: np.ndarray) -> np.ndarray:
         """How badly the images are explained through each vertex if just the vertices ``opaque`` are.
@@ -154,8 +145,8 @@ class RadianceGhost:
         sums = [dr.zeros(mi.Float, self.vertex_count) for _ in range(2)]
         with dr.suspend_grad():
             for step in range(_ERROR_STEPS):
-                sample, radiance, _, sheets = self._render(_EXTRA_STEP + _REFIT_STEPS + step)
-                difference = dr.abs(self._tone(radiance) - self._tone(sample.radiance))
+                sample, radiance, _, sheets = self.render(_EXTRA_STEP + _REFIT_STEPS + step)
+                difference = dr.abs(self.tone(radiance) - self.tone(sample.radiance))
                 if not sheets:
                     continue
                 first = sheets[0]
@@ -172,7 +163,7 @@ class RadianceGhost:
         total = mi.Float(0)
         with dr.suspend_grad():
             for step in range(_ERROR_STEPS):
-                sample = pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
+                sample = pixels.sample(self.config.batch, seed=self.seed, step=step)
                 ray = self.views.rays(sample.view, sample.film)
                 radiance, _ = self.see(ray)
                 total += losses.log_l1(radiance, sample.radiance)
@@ -186,12 +177,29 @@ class RadianceGhost:
             self._normals = self._smooth_normals()
         move_mesh(self.scene, positions)
 
+    def take_over(self, positions: np.ndarray, fitted: Mapping[str, np.ndarray], opaque: np.ndarray) -> None:
+        """Goes on where another one on the same template was after a ``refit``.
+
+        Args:
+            positions: (V, 3) of the vertices.
+            fitted: what its ``fitted`` gave.
+            opaque: (V,) which vertices are.
+        """
+        self.move(mi.Float(positions.ravel()))
+        self._set_opacity(np.where(opaque, _CERTAIN_LOGIT, -_CERTAIN_LOGIT))
+        self._opacity_rests = True
+        restore_optimizer("radiance", self.optimizer, fitted)
+
+    def fitted(self) -> dict[str, np.ndarray]:
+        """What ``take_over`` needs."""
+        return optimizer_arrays("radiance", self.optimizer)
+
     def _set_opacity(self, logits: np.ndarray) -> None:
         """New logits, and an optimiser without memory of what led to the old ones."""
         self.optimizer["opacity"] = mi.Float(logits.astype(np.float32))
         self.optimizer.reset()
 
-    def _render(self, step: int) -> tuple[PixelSample, mi.Color3f, mi.Float, list[Sheet]]:
+    def render(self, step: int) -> tuple[PixelSample, mi.Color3f, mi.Float, list[Sheet]]:
         """The random pixels of a step, their radiance and coverage, and the sheets behind them."""
         sample, sheets = self.look(step)
         radiance, alpha = self.composite(sheets, dr.width(sample.view))
@@ -201,7 +209,7 @@ class RadianceGhost:
 
     def look(self, step: int) -> tuple[PixelSample, list[Sheet]]:
         """The random pixels of a step, and the sheets that the rays through them meet."""
-        sample = self.pixels.sample(self.config.ghost_batch, seed=self.config.seed, step=step)
+        sample = self.pixels.sample(self.config.batch, seed=self.seed, step=step)
         return sample, self._sheets(self.views.rays(sample.view, sample.film))
 
     def see(self, ray: mi.Ray3f) -> tuple[mi.Color3f, mi.Float]:
@@ -244,7 +252,7 @@ class RadianceGhost:
         kept = dr.detach(self.optimizer["opacity"]).numpy() > 2 * _INITIAL_LOGIT
         return Preview(vertices, faces[kept[faces].all(axis=1)], self.radiance()[0], vertices, faces)
 
-    def _sides(self) -> tuple[mi.Color3f, mi.Color3f]:
+    def sides(self) -> tuple[mi.Color3f, mi.Color3f]:
         """Of every vertex, what the softplus makes radiance of: front and back."""
         vertex = dr.arange(mi.UInt32, self.vertex_count)
         return tuple(dr.gather(mi.Color3f, self.optimizer["radiance"], 2 * vertex + side,
@@ -265,7 +273,7 @@ class RadianceGhost:
             dr.eval(transmittance)
             return transmittance > _NEGLIGIBLE
 
-        return trace_sheets(self.scene, self._positions, self._faces, ray, self.config.ghost_sheets,
+        return trace_sheets(self.scene, self._positions, self._faces, ray, self.config.layers,
                             self._offset, goes_on if self._opacity_rests else None)
 
     def composite(self, sheets: list[Sheet], count: int) -> tuple[mi.Color3f, mi.Float]:

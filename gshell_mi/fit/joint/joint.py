@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -11,21 +13,25 @@ import numpy as np
 from ... import losses
 from ...color_detail import ColorDetail, moved
 from ...errors import UserError
+from ...fields import LatticeFields
 from ...fields.smoothing import LatticeDiffusion
 from ...images import decibels
 from ...light import EnvironmentLight
 from ...material import GivenMaterial, MaterialField, principled
 from ...means import mean
 from ...outliers import finite
-from ...parametrisation import StepRules, make_parametrisation
+from ...parametrisation import StepRules, make_parametrisation, parametrisation_named
 from ...scene import FitScene
 from ...schedules import decay_at
 from ...tempered_adam import TemperedAdam
 from ...timing import phase
 from ..bookkeeping.observer import Preview
-from ..config import FitConfig
 from ..ghost.opening import without_specks
-from .regularisers import Regularisers
+from .regularisers import Regularisers, StepView
+
+if TYPE_CHECKING:
+    from ..config import FitConfig
+    from ..stages.joint import JointConfig
 
 #: Between the first sampler seeds of fits whose seeds are neighbours: no step shares its samples.
 _SEEDS_APART = 1 << 20
@@ -47,13 +53,18 @@ class JointStage:
         fit: the scene with its targets.
         material: a ``GivenMaterial`` stays as it is.
         light: None keeps the scene's.
-        config: settings of the stage.
+        config: what all stages know.
         detail_side: voxels per side of the base colour's detail; 0 for none.
+        stage: settings of the stage; default: those of the joint stage.
+        iterations: its steps; default: those of the joint stage.
     """
 
     def __init__(self, fit: FitScene, material: MaterialField | GivenMaterial, light: EnvironmentLight | None,
-                 config: FitConfig, detail_side: int = 0):
+                 config: FitConfig, detail_side: int = 0, *, stage: JointConfig | None = None,
+                 iterations: int | None = None):
         self.fit, self.material, self.light, self.config = fit, material, light, config
+        self.stage = stage or config.joint
+        self.iterations = config.iterations if iterations is None else iterations
         self.subject = fit.subject
         self.detail = self._color_detail(detail_side)
         texture = None
@@ -69,30 +80,31 @@ class JointStage:
         self._sees_masks = all(target.has_alpha for target in fit.targets) and not config.geometry_only
         if config.geometry_only:
             self.subject.shade_flat()
-        self.integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.max_depth,
-                                        "gradient_depth": config.gradient_depth,
-                                        "reparam_depth": config.reparam_depth, "hide_emitters": True})
+        self.integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.render.max_depth,
+                                        "gradient_depth": config.render.gradient_depth,
+                                        "reparam_depth": config.render.reparam_depth, "hide_emitters": True})
         resting = {"msdf"} if config.watertight else set()
-        if not config.flexicubes_weights:
+        if not parametrisation_named(config.model.field).moves_weights:
             resting.add("weights")
         moving = [name for name in self.subject.field_names if name not in resting]
         start = {name: self.parameters[f"subject.{name}"] for name in moving}
-        rules = StepRules(config.geometry_lr, config.msdf_lr, config.deform_lr, config.geometry_smoothing,
-                          config.geometry_detail)
-        self.geometry = make_parametrisation(config.field, start, self.subject.lattice, rules,
+        stage = self.stage
+        rules = StepRules(stage.geometry_lr, stage.msdf_lr, stage.deform_lr, stage.geometry_smoothing,
+                          stage.geometry_detail)
+        self.geometry = make_parametrisation(config.model.field, start, self.subject.lattice, rules,
                                              seed=config.seed)
         #: The lattice fields of the present step, with gradients enabled; none before the geometry moves.
         self.fields: dict[str, mi.Float] = {}
-        self.material_optimizer = mi.ad.Adam(lr=config.material_lr, params=material.parameters)
-        self.detail_optimizer = mi.ad.Adam(lr=config.material_lr)
+        self.material_optimizer = mi.ad.Adam(lr=stage.material_lr, params=material.parameters)
+        self.detail_optimizer = mi.ad.Adam(lr=stage.material_lr)
         if self.detail:
             self.detail_optimizer["detail"] = self.detail.values
             self._detail_parameter = next(name for name in self.parameters.keys() if name.endswith(".detail"))
         # What a mean over all pixels says of one texel may be smaller than the epsilon that is usual.
-        self.light_optimizer = TemperedAdam(lr=config.light_lr, epsilon=1e-12,
+        self.light_optimizer = TemperedAdam(lr=stage.light_lr, epsilon=1e-12,
                                             params={"log_radiance": light.log_radiance} if light else None)
-        self._regularisers = Regularisers(fit, self.scene, material if material.parameters else None, light,
-                                          config)
+        sought = material if material.parameters else None
+        self._regularisers = Regularisers(StepView(fit, self.scene, sought, light), config.losses)
 
     @property
     def optimizers(self) -> dict[str, mi.ad.Adam]:
@@ -105,9 +117,8 @@ class JointStage:
         Raises:
             UserError: the steps before have left no surface.
         """
-        config = self.config
         given = not (self.material_optimizer.state or self.light_optimizer.state)
-        moving = given or iteration >= config.warmup * config.iterations
+        moving = given or iteration >= self.stage.warmup * self.iterations
         with phase("scene update"):
             self.apply(geometry=moving)
         views = self._views(iteration)
@@ -117,13 +128,13 @@ class JointStage:
             mask = sum(self._mask_loss(view, image) for view, image in zip(views, images, strict=True))
             color, mask = color / len(views), mask / len(views)
             regularisation, terms = self._regularisers(views)
-            total = color + config.joint_mask * mask + regularisation
+            total = color + self.config.losses.mask * mask + regularisation
             compute(total)
         with phase("backward") as compute:
             dr.backward(total)
             sought = (self.fields, self.material_optimizer, self.light_optimizer, self.detail_optimizer)
             compute(*(dr.grad(value) for values in sought for value in values.values()))
-        progress = iteration / max(config.iterations, 1)
+        progress = iteration / max(self.iterations, 1)
         with phase("optimiser"):
             diffuse = LatticeDiffusion(self.subject.lattice, cells=self.subject.surface.cells)
             if moving:
@@ -140,7 +151,7 @@ class JointStage:
 
     def seed(self, iteration: int, turn: int = 0) -> int:
         """Of the samples of a step's view; the next number is that of its gradient's."""
-        turn += iteration * self.config.step_views
+        turn += iteration * self.config.render.views
         return (self.config.seed * _SEEDS_APART + 2 * turn) % 2**32
 
     def finish(self) -> None:
@@ -148,14 +159,17 @@ class JointStage:
         self.apply(geometry=True)
         subject = self.subject
         self.parameters["subject.msdf"] = without_specks(subject.msdf, subject.template(), subject.lattice,
-                                                         self.config.ghost_min_area)
+                                                         self.config.min_area)
         self.parameters.update()
 
-    def outcome(self) -> dict[str, np.ndarray]:
-        """What a stage on a finer lattice starts from, as host arrays, after ``finish``."""
+    def moved_fields(self) -> LatticeFields:
+        """The geometry, after ``finish``."""
         fields = self.subject.fields()
-        arrays = {"sdf": fields.sdf, "msdf": fields.msdf, "deform": fields.deform}
-        arrays |= {name: field.numpy() for name, field in self.material.parameters.items()}
+        return fields if fields.weights is None or fields.weights.any() else replace(fields, weights=None)
+
+    def model(self) -> dict[str, np.ndarray]:
+        """Material and light as a stage on a finer lattice starts from, as host arrays, after ``finish``."""
+        arrays = {name: field.numpy() for name, field in self.material.parameters.items()}
         arrays |= self.detail_arrays()
         return arrays | ({"log_radiance": self.light.log_radiance.numpy()} if self.light else {})
 
@@ -171,13 +185,13 @@ class JointStage:
     def _views(self, iteration: int) -> list[int]:
         """Those of a step: every view once per round, in an order that depends on seed and round alone."""
         count, views = len(self.fit.sensors), []
-        for turn in range(iteration * self.config.step_views, (iteration + 1) * self.config.step_views):
+        for turn in range(iteration * self.config.render.views, (iteration + 1) * self.config.render.views):
             order = np.random.default_rng((self.config.seed, turn // count)).permutation(count)
             views.append(int(order[turn % count]))
         return views
 
     def _render(self, view: int, seed: int) -> mi.TensorXf:
-        config = self.config
+        config = self.config.render
         with phase("render") as compute:
             image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[view],
                               integrator=self.integrator, spp=config.primal_spp, spp_grad=config.spp,
@@ -186,7 +200,7 @@ class JointStage:
         return image
 
     def _image_loss(self, view: int, image: mi.TensorXf) -> mi.Float:
-        return losses.IMAGE_LOSSES[self.config.image_loss](image[..., :3], self._targets[view][..., :3])
+        return losses.IMAGE_LOSSES[self.config.losses.image](image[..., :3], self._targets[view][..., :3])
 
     def _mask_loss(self, view: int, image: mi.TensorXf) -> mi.Float:
         if not self._sees_masks:
@@ -212,8 +226,7 @@ class JointStage:
         self.parameters.update()
         if self.subject.surface.is_empty:
             raise UserError("The joint stage has left no surface; start again with --overwrite and a smaller "
-                            "--geometry-lr, or less weight on what opens it (--hole-opening, "
-                            "--visible-outside).")
+                            "--joint.geometry-lr.")
 
     def _follow_surface(self, *, rescan: bool) -> None:
         """Moves the blocks that the fields are stored in, and all that is stored with them."""
@@ -257,13 +270,13 @@ class JointStage:
             value, promoted, rate, (step, moved(first, source), moved(second, source), largest))
 
     def _step_material(self, progress: float, diffuse: LatticeDiffusion) -> None:
-        config, optimizer = self.config, self.material_optimizer
+        config, optimizer = self.stage, self.material_optimizer
         if not optimizer.state:
             return
         # One derivative that is no number would spread over all others, and stay in the optimiser for good.
         gradients = {name: finite(dr.grad(optimizer[name])) for name in optimizer.keys()}
         gradients |= diffuse.together({name: gradients[name] for name in self.material.on_lattice},
-                                      config.material_gradient_smoothing)
+                                      config.material_smoothing)
         for name, gradient in gradients.items():
             dr.set_grad(optimizer[name], gradient)
         rates = dict.fromkeys(optimizer.keys(), decay_at(progress) * config.material_lr)
@@ -283,7 +296,7 @@ class JointStage:
             return
         gradient = finite(dr.grad(optimizer["log_radiance"]))
         dr.set_grad(optimizer["log_radiance"], gradient / self.light.solid_angles)
-        optimizer.set_learning_rate(decay_at(progress) * self.config.light_lr)
+        optimizer.set_learning_rate(decay_at(progress) * self.stage.light_lr)
         optimizer.step()
 
 

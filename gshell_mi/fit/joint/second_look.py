@@ -63,9 +63,6 @@ _WAY = 14.0
 #: Strips that part openings which have met are at most so many vertices wide on either side.
 _STRIP = 2
 
-#: Of the names in a checkpoint.
-_PREFIX = "second_look/"
-
 #: Mean thickness, in cells, up to which a loose part is a sheet; lattices hold none thinner than one.
 _SHEET = 1.5
 
@@ -86,21 +83,21 @@ class SecondLook:
     def __init__(self, joint: JointStage, views: PinholeViews, pixels: PixelPool,
                  state: Mapping[str, np.ndarray]):
         self.joint, self._views, self._pixels = joint, views, pixels
-        config, count = joint.config, joint.config.iterations
+        count = joint.iterations
         #: The steps before which openings change and are judged.
-        self._changes = round(config.second_look * count)
+        self._changes = round(joint.stage.revision * count)
         self._judges = (self._changes + count + 1) // 2
-        if config.field != "explicit" or config.watertight or self._judges >= count:
+        if not joint.geometry.is_explicit or joint.config.watertight or self._judges >= count:
             self._changes = count     # never
-        self._state = {name: array for name, array in state.items() if name.startswith(_PREFIX)}
-        if (held := self._state.pop(f"{_PREFIX}held", None)) is not None:
+        self._state = dict(state)
+        if (held := self._state.pop("held", None)) is not None:
             joint.geometry.held = mi.Bool(held)
 
     def step(self, iteration: int) -> Mapping[str, float]:
         """One step of the joint stage, after what is to be done before it."""
         if iteration == self._changes:
             self._change(iteration)
-        elif iteration == self._judges and f"{_PREFIX}points" in self._state:
+        elif iteration == self._judges and "points" in self._state:
             self._judge(iteration)
         return self.joint.step(iteration)
 
@@ -111,7 +108,7 @@ class SecondLook:
     def state(self) -> dict[str, np.ndarray]:
         """What a checkpoint keeps, so that a fit that goes on judges alike."""
         held = self.joint.geometry.held
-        return self._state | ({} if held is None else {f"{_PREFIX}held": held.numpy()})
+        return self._state | ({} if held is None else {"held": held.numpy()})
 
     def finish(self) -> bool | None:
         """Ends the joint stage; returns whether openings have changed for good, None if none was doubted.
@@ -122,7 +119,7 @@ class SecondLook:
         that have closed on the way, or have come back of themselves, open on one side.
         """
         changed = self._settle()
-        if self._changes < self.joint.config.iterations:
+        if self._changes < self.joint.iterations:
             self._open_loose_sheets()
         # Last of all: looking at the template brings the specks back.
         self.joint.finish()
@@ -131,7 +128,7 @@ class SecondLook:
     def _settle(self) -> bool | None:
         """Keeps or undoes what has changed, by the boundary loops that come of it; see ``finish``, which
         ends the stage."""
-        kept = self._state.get(f"{_PREFIX}kept")
+        kept = self._state.get("kept")
         if kept is None or not kept.any():
             return None if kept is None else False
         self._join(kept)
@@ -151,7 +148,7 @@ class SecondLook:
         self.joint.finish()
         none = np.zeros_like(kept)
         if self._loops_off(none) < off:
-            self._state[f"{_PREFIX}kept"] = none
+            self._state["kept"] = none
             return False
         self.joint.geometry.replace("msdf", msdf)
         return True
@@ -184,21 +181,21 @@ class SecondLook:
         loops = _loops(vertices, faces, solid)
         spent = [np.subtract(loops, _loops(vertices, faces, solid | (shut & (patch == index))))
                  for index in range(patch.max() + 1)]
-        self._state = {f"{_PREFIX}points": vertices, f"{_PREFIX}values": values, f"{_PREFIX}patch": patch,
-                       f"{_PREFIX}errors": _errors(found, patch, ~before),
-                       f"{_PREFIX}loops": np.array(loops), f"{_PREFIX}spent": np.array(spent),
-                       f"{_PREFIX}cell": np.float64(self.joint.subject.cell_size)}
+        self._state = {"points": vertices, "values": values, "patch": patch,
+                       "errors": _errors(found, patch, ~before),
+                       "loops": np.array(loops), "spent": np.array(spent),
+                       "cell": np.float64(self.joint.subject.cell_size)}
 
     def _judge(self, iteration: int) -> None:
         template, vertices, _, values = self._template()
-        patch, then = self._patches(vertices)[1], self._state[f"{_PREFIX}errors"]
+        patch, then = self._patches(vertices)[1], self._state["errors"]
         now = _errors(self._explained(template, iteration, behind=False), patch, values > 0, len(then) - 1)
         # All of the surface has been explained better since.
         ratio = now[:-1] / then[:-1] * (then[-1] / now[-1])
-        unjustified = ratio >= self.joint.config.second_look_gain
+        unjustified = ratio >= self.joint.stage.revision_gain
         self.joint.geometry.held = None
         self._undo(unjustified)
-        self._state[f"{_PREFIX}kept"] = ~unjustified
+        self._state["kept"] = ~unjustified
         self._open_sheets(~unjustified)
         self._join(~unjustified)
 
@@ -213,16 +210,16 @@ class SecondLook:
         """Opens one side of the sheets among the loose parts that have come back in kept patches (P,)."""
         template, vertices, faces, values = self._template()
         nearest, patch = self._patches(vertices)
-        back = (patch >= 0) & kept[patch] & (self._state[f"{_PREFIX}values"][nearest] <= 0)
+        back = (patch >= 0) & kept[patch] & (self._state["values"][nearest] <= 0)
         part = mesh_components(faces, len(vertices))
         elsewhere = 2 * np.bincount(part, back) < np.bincount(part)
         side = self._open_sides(template, vertices, faces,
                                 elsewhere[part] | self._openings(vertices, faces, values))
         for sheet in np.unique(part[side]):
             owner = np.bincount(patch[back & (part == sheet)]).argmax()
-            self._state[f"{_PREFIX}spent"][owner] -= (1, 0)
+            self._state["spent"][owner] -= (1, 0)
         # From here on these are openings like those from before.
-        self._state[f"{_PREFIX}patch"][nearest[side]] = -1
+        self._state["patch"][nearest[side]] = -1
 
     def _open_sides(self, template: SurfaceMesh, vertices: np.ndarray, faces: np.ndarray,
                     others: np.ndarray) -> np.ndarray:
@@ -255,14 +252,14 @@ class SecondLook:
         template, vertices, _, _ = self._template()
         nearest, patch = self._patches(vertices)
         undone = (patch >= 0) & chosen[patch]
-        before = self._state[f"{_PREFIX}values"][nearest]
+        before = self._state["values"][nearest]
         self._write(template, before, undone)
 
     def _loops_off(self, kept: np.ndarray) -> int:
         """By how much the surface's loops differ from those before but those of openings that were shut, and
         how many new pin-holes it has."""
         found = topology(*self.joint.subject.surface.to_numpy()[:2])
-        loops, pinholes = self._state[f"{_PREFIX}loops"] - self._state[f"{_PREFIX}spent"][kept].sum(axis=0)
+        loops, pinholes = self._state["loops"] - self._state["spent"][kept].sum(axis=0)
         return int(abs(found.boundary_loops - loops) + max(found.pinholes - max(pinholes, 0), 0))
 
     def _msdf(self) -> mi.Float:
@@ -297,9 +294,9 @@ class SecondLook:
     def _patches(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of vertices (V, 3) of the present template the nearest ones of that which was changed, and their
         patches, -1 for none."""
-        distance, nearest = cKDTree(self._state[f"{_PREFIX}points"]).query(vertices)
+        distance, nearest = cKDTree(self._state["points"]).query(vertices)
         near = distance < _NEAR * self._cell
-        return nearest, np.where(near, self._state[f"{_PREFIX}patch"][nearest], -1)
+        return nearest, np.where(near, self._state["patch"][nearest], -1)
 
     def _openings(self, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
         """(V,) what is open, but for what is too small to be meant."""
@@ -307,7 +304,7 @@ class SecondLook:
 
     def _cleaned(self, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
         """The mSDF (V,) without the openings and the islands that are too small to be meant."""
-        return clean_opacity(values, vertices, faces, self.joint.config.ghost_min_area)
+        return clean_opacity(values, vertices, faces, self.joint.config.min_area)
 
     @property
     def _reach(self) -> float:
@@ -317,7 +314,7 @@ class SecondLook:
     @property
     def _cell(self) -> float:
         """Size of a cell of the lattice on which openings have changed, or shall."""
-        return float(self._state.get(f"{_PREFIX}cell", self.joint.subject.cell_size))
+        return float(self._state.get("cell", self.joint.subject.cell_size))
 
     @property
     def _scale(self) -> float:

@@ -19,9 +19,9 @@ from ...bricks import BRICK, Bricks
 from ...images import decibels
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
-from ..config import FitConfig
 from ..ghost.contrast import Contrast
 from ..ghost.pixels import PixelPool
+from .config import VolumeConfig
 from .marching import Adjoint, Rays, composite, depth_along
 
 #: Voxels per side of each level over those of the last one, and shares of the steps.
@@ -67,14 +67,16 @@ class RadianceVolume:
         to_world: from the cube to the world.
         views: the cameras.
         pixels: the targets' pixels.
-        config: ``volume_*`` fields.
+        config: how it is trained.
         surface: vertices (V, 3) and faces (F, 3) to show meanwhile, world units.
         stored: what ``arrays`` gave, of a run to go on with.
+        seed: of the random pixels.
     """
 
     def __init__(self, hull: np.ndarray, to_world: mi.ScalarTransform4f, views: PinholeViews,
-                 pixels: PixelPool, config: FitConfig, surface: tuple[np.ndarray, np.ndarray],
-                 stored: Mapping[str, np.ndarray] | None = None):
+                 pixels: PixelPool, config: VolumeConfig, surface: tuple[np.ndarray, np.ndarray],
+                 stored: Mapping[str, np.ndarray] | None = None, *, seed: int = 0):
+        self.seed = seed
         self.views, self.pixels, self.config, self.surface = views, pixels, config, surface
         self.to_lattice = mi.Transform4f(to_world).inverse()
         self.mean_radiance = pixels.mean_radiance()
@@ -83,7 +85,7 @@ class RadianceVolume:
                                   wrap_mode=dr.WrapMode.Clamp)
         self._reach = _OUTSIDE * 2 / len(hull)
         self._sides = _sides(config)
-        counts = np.round(np.multiply(_SHARES, config.volume_iterations))
+        counts = np.round(np.multiply(_SHARES, config.iterations))
         #: The first step of each level, and the end of all.
         self._begins = [0, *(int(step) for step in np.cumsum(counts))]
         #: By name; another one on each level.
@@ -99,7 +101,7 @@ class RadianceVolume:
             self._begin(Bricks.where(near.reshape(m, zoom, m, zoom, m, zoom).any(axis=(1, 3, 5))))
 
     @staticmethod
-    def first_side(config: FitConfig) -> int:
+    def first_side(config: VolumeConfig) -> int:
         """Voxels per side of the first level."""
         return _sides(config)[0]
 
@@ -121,11 +123,11 @@ class RadianceVolume:
         error, missing = self._tone(seen.radiance) - self._tone(target), 1 - seen.transmittance - alpha
         image = dr.sum(dr.dot(error, dr.gather(mi.Color3f, dr.detach(error), other)))
         mask = dr.sum(missing * dr.gather(mi.Float, dr.detach(missing), other))
-        weight = self.pixels.mask_weight(config.volume_mask)
+        weight = self.pixels.mask_weight(config.mask)
         dr.backward(image + weight * mask)
         adjoint = Adjoint(dr.detach(seen.radiance), dr.detach(seen.transmittance), seen.spread,
                           dr.grad(seen.radiance), dr.grad(seen.transmittance),
-                          dr.opaque(mi.Float, config.volume_distortion))
+                          dr.opaque(mi.Float, config.distortion))
         self._descend(composite(self.bricks, packets, rays, iteration, adjoint=adjoint), iteration)
         count = max(dr.width(alpha), 1)
         image, mask = image[0] / count, mask[0] / count
@@ -212,7 +214,7 @@ class RadianceVolume:
 
     def _rays(self, step: int) -> tuple[Rays, mi.Color3f, mi.Float]:
         """Random pixels' rays, and the targets' radiance and coverage."""
-        sample = self.pixels.sample(self.config.volume_batch // _RAYS, seed=self.config.seed, step=step,
+        sample = self.pixels.sample(self.config.batch // _RAYS, seed=self.seed, step=step,
                                     rays=_RAYS, together=_TOGETHER)
         ray = self.to_lattice @ self.views.rays(sample.view, sample.film)
         return Rays.through(self.bricks, ray, jitter=step), sample.radiance, sample.alpha
@@ -250,15 +252,15 @@ class RadianceVolume:
         last = self.level == len(self._sides) - 1
         decay = (0.1 if last else 0.5) ** ((iteration - begin) / max(end - begin, 1))
         bright = decay * self.mean_radiance
-        optimizer.set_learning_rate({"density": decay * config.volume_density_lr,
-                                     "radiance": bright * config.volume_radiance_lr,
-                                     "direction": bright * config.volume_direction_lr if self.level else 0.0})
+        optimizer.set_learning_rate({"density": decay * config.density_lr,
+                                     "radiance": bright * config.radiance_lr,
+                                     "direction": bright * config.direction_lr if self.level else 0.0})
         optimizer.step()
         if self.level:
             kept = dr.opaque(mi.Float, 1 - _DIRECTION_DECAY)
             optimizer["direction"] = kept * dr.detach(optimizer["direction"])
 
 
-def _sides(config: FitConfig) -> list[int]:
+def _sides(config: VolumeConfig) -> list[int]:
     """Voxels per side of each level, in whole bricks."""
-    return [max(BRICK, round(share * config.volume_side / BRICK) * BRICK) for share in _SIDES]
+    return [max(BRICK, round(share * config.side / BRICK) * BRICK) for share in _SIDES]

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..bookkeeping.bookkeeping import Worker
 from ..bookkeeping.observer import Preview
+from ..stage import Work
 
 
 class Descent:
@@ -22,7 +22,7 @@ class Descent:
         state: has the ``descent`` so far, (2,) sums of losses at first and later, where the worker goes on.
     """
 
-    def __init__(self, worker: Worker, count: int, gain: float, state: Mapping[str, np.ndarray]):
+    def __init__(self, worker: Work, count: int, gain: float, state: Mapping[str, np.ndarray]):
         self.worker, self.gain = worker, gain
         self._judged = -(-count // 4)
         self._width = -(-self._judged // 8)

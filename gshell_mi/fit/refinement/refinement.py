@@ -10,6 +10,7 @@ material, hence no noise, and a step looks at all views at once.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -23,10 +24,12 @@ from ...outliers import trusted
 from ...schedules import falling
 from ...triangles import face_areas
 from ..bookkeeping.observer import Preview
-from ..config import FitConfig
 from ..ghost.radiance_ghost import RadianceGhost
 from ..ghost.sheets import Sheet
 from .outlines import Outlines
+
+if TYPE_CHECKING:
+    from ..stages.refinement import RefinementConfig
 
 #: Views whose outlines a step compares.
 _OUTLINE_VIEWS = 8
@@ -47,12 +50,14 @@ class PhotometricRefinement:
         faces: (F, 3) of the watertight template.
         outlines: the masks; None if the targets have none.
         length: side of a lattice cell, world units.
-        config: ``refinement_*`` fields.
+        config: of the round.
+        seed: of the views whose outlines a step compares.
     """
 
     def __init__(self, ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray,
-                 outlines: Outlines | None, length: float, config: FitConfig):
+                 outlines: Outlines | None, length: float, config: RefinementConfig, seed: int = 0):
         self.ghost, self.faces, self.outlines, self.config = ghost, faces, outlines, config
+        self.seed = seed
         self.length = length
         area = face_areas(vertices, faces).sum()
         #: Vertices per square cell: what turns a lambda of cells into one of edges.
@@ -65,7 +70,7 @@ class PhotometricRefinement:
     def step(self, iteration: int) -> dict[str, float]:
         """One step on random pixels of all views; returns the losses."""
         config, ghost, optimizer = self.config, self.ghost, self.optimizer
-        progress = iteration / config.refinement_iterations
+        progress = iteration / config.iterations
         positions = optimizer["positions"]
         ghost.move(dr.detach(positions))
         sample, sheets = ghost.look(iteration)
@@ -75,13 +80,13 @@ class PhotometricRefinement:
         image = share * losses.log_l1(radiance, sample.radiance)
         total, outline = image, mi.Float(0)
         if self.outlines:
-            chosen = np.random.default_rng((config.seed, iteration)).permutation(len(ghost.views))
+            chosen = np.random.default_rng((self.seed, iteration)).permutation(len(ghost.views))
             outline = self.outlines.loss(positions, ghost.scene, chosen[:_OUTLINE_VIEWS]) / self.length**2
             # Silhouettes lead at first, while the radiance is still that of the wrong place.
-            total = total + dr.opaque(mi.Float, (1 - progress / 2) * config.refinement_outline) * outline
+            total = total + dr.opaque(mi.Float, (1 - progress / 2) * config.outline) * outline
         dr.backward(total)
         self._move(progress, iteration)
-        ghost.update(("radiance",), config.refinement_radiance_lr)
+        ghost.update(("radiance",), config.radiance_lr)
         error = share * mean(dr.square(dr.detach(radiance) - sample.radiance))
         return {"loss": total[0], "image": image[0], "outline": outline[0],
                 "psnr": decibels(error[0])}
@@ -97,13 +102,13 @@ class PhotometricRefinement:
     def _move(self, progress: float, iteration: int) -> None:
         config, optimizer = self.config, self.optimizer
         if self._diffuse is None or iteration % _FACTORISE_EVERY == 0:
-            start = (iteration - iteration % _FACTORISE_EVERY) / config.refinement_iterations
-            smoothing = falling(config.refinement_smoothing, config.refinement_detail, start)
+            start = (iteration - iteration % _FACTORISE_EVERY) / config.iterations
+            smoothing = falling(config.smoothing, config.detail, start)
             self._diffuse = MeshDiffusion(self.faces, self.ghost.vertex_count, self._density * smoothing)
         gradient = trusted(dr.grad(optimizer["positions"]), _OUTLIER)
         dr.set_grad(optimizer["positions"], self._diffuse(gradient))
         decay = 0.5 * (1 + np.cos(np.pi * progress))
-        optimizer.set_learning_rate({"positions": decay * config.refinement_lr * self.length})
+        optimizer.set_learning_rate({"positions": decay * config.lr * self.length})
         optimizer.step()
 
 

@@ -18,7 +18,7 @@ def checkpoint() -> Checkpoint:
     rng = np.random.default_rng(0)
     arrays = {"sdf": rng.normal(size=27).astype(np.float32), "known": np.array([True, False]),
               "ghost/opacity/step": np.array([3], np.uint32)}
-    return Checkpoint("ghost", 17, {"seed": 3, "resolution": None, "spp": 8, "warmup": 0.15}, arrays,
+    return Checkpoint("openings", 17, {"seed": 3, "resolution": None, "spp": 8, "warmup": 0.15}, arrays,
                       {"hull": 1.25})
 
 
@@ -167,7 +167,7 @@ def test_one_that_unpacks_to_much_is_refused_unread(tmp_path):
 
 def test_a_missing_array_is_the_files_fault(tmp_path):
     """As of one that was crafted whole."""
-    Checkpoint("ghost", 0, {}, {"sdf": np.zeros(8)}).save(tmp_path / "checkpoint.npz")
+    Checkpoint("openings", 0, {}, {"sdf": np.zeros(8)}).save(tmp_path / "checkpoint.npz")
     loaded = Checkpoint.load(tmp_path / "checkpoint.npz")
     with pytest.raises(UserError, match=r"checkpoint.npz' is damaged \(it lacks 'hull'\)"):
         loaded.arrays["hull"]

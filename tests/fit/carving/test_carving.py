@@ -4,14 +4,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from cup import CONFIG, HALF, capture, cup, hull_of, solid_block
+from cup import CONFIG, HALF, cup, fit_of, hull_of, solid_block, surface_of
 from scipy.spatial import cKDTree
 
 from gshell_mi.fit.carving import carving
 from gshell_mi.fit.carving.carving import carve
 from gshell_mi.fit.carving.radiance_volume import RadianceVolume
 from gshell_mi.fit.ghost.ghost_template import ghost_template
-from gshell_mi.fit.ghost.pixels import PixelPool
 from gshell_mi.lattice import make_lattice
 
 RESOLUTION = 32
@@ -24,36 +23,34 @@ def trained():
     """A function that carves the hull of a shape."""
     subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
     hull, vertices, faces = hull_of(RESOLUTION)
-    field = hull.ravel().astype(np.float32)
-    state = {"sdf": field, "hull": field, "msdf": np.ones_like(field)}
+    before = surface_of(hull, np.ones_like(hull))
     volumes = {}
 
     def run(shape, **fields):
         if shape not in volumes:
-            views, _, targets = capture(shape())
-            held_out = np.arange(len(views)) % 6 == 0
-            known, unknown = (PixelPool(views, targets, np.flatnonzero(chosen))
-                              for chosen in (~held_out, held_out))
-            volume = RadianceVolume(hull, vertices, faces, subject.to_world, views, known, CONFIG)
-            for step in range(CONFIG.carving_iterations):
+            fit = fit_of(subject, shape())
+            volume = RadianceVolume(hull, vertices, faces, subject.to_world, fit.views, fit.training,
+                                    CONFIG.cavities)
+            for step in range(CONFIG.cavities.iterations):
                 volume.step(step)
-            volumes[shape] = volume, known, unknown
-        return subject, state, carve(subject, state | fields, subject.lattice, *volumes[shape])
+            volumes[shape] = fit, volume
+        fit, volume = volumes[shape]
+        return subject, before, carve(fit, before.with_fields(**fields), volume)
 
     return run
 
 
 def test_a_cup_is_found(trained):
-    subject, state, carved = trained(cup)
-    sdf = carved["sdf"].reshape((RESOLUTION + 1,) * 3)
+    subject, before, carved = trained(cup)
+    sdf = carved.fields.sdf.reshape((RESOLUTION + 1,) * 3)
     centre, half_depth = RESOLUTION // 2, round(0.5 * HALF / CELL)
     assert sdf[centre, centre + half_depth, centre] > 0 > sdf[centre, centre - half_depth, centre]
-    found = ghost_template(subject, carved, subject.lattice)
+    found = ghost_template(subject, carved)
     inner = np.abs(found.start).max(axis=1) < HALF - 0.25 * CELL
     truth, _ = trimesh.sample.sample_surface(cup(), 40000, seed=1)
     distance = cKDTree(truth).query(found.start[inner])[0]
     assert inner.sum() > 300 and np.median(distance) < 0.7 * CELL
-    np.testing.assert_array_equal(carved["hull"], np.maximum(carved["hull"], state["hull"]))
+    np.testing.assert_array_equal(carved.hull, np.maximum(carved.hull, before.hull))
 
 
 def test_a_block_stays(trained):
@@ -70,38 +67,35 @@ def test_openings_that_there_were_stay(trained, monkeypatch):
     monkeypatch.setattr(carving, "close_unjustified", lambda logits, *_: np.abs(logits))
     _, y, _ = LATTICE.vertex_positions().T
     msdf = np.where(y < -HALF + CELL, -CELL, CELL).astype(np.float32)
-    carved = trained(cup, msdf=msdf)[2]
-    sdf = carved["sdf"].reshape((RESOLUTION + 1,) * 3)
+    fields = trained(cup, msdf=msdf)[2].fields
+    sdf = fields.sdf.reshape((RESOLUTION + 1,) * 3)
     centre = RESOLUTION // 2
     assert sdf[centre, centre + round(0.5 * HALF / CELL), centre] > 0, "carved"
-    near = np.abs(carved["sdf"]) < CELL
-    assert (carved["msdf"][near & (y < -HALF + 0.5 * CELL)] < 0).mean() > 0.9
-    assert (carved["msdf"][near & (y > -HALF + 3 * CELL)] > 0).all()
+    near = np.abs(fields.sdf) < CELL
+    assert (fields.msdf[near & (y < -HALF + 0.5 * CELL)] < 0).mean() > 0.9
+    assert (fields.msdf[near & (y > -HALF + 3 * CELL)] > 0).all()
 
 
 def test_new_parts_are_solid_and_old_ones_keep_their_opacity():
     subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
     hull, _, _ = hull_of(RESOLUTION)
-    field = hull.ravel().astype(np.float32)
     z = np.repeat(np.linspace(-1, 1, RESOLUTION + 1), (RESOLUTION + 1) ** 2).astype(np.float32)
-    state = {"sdf": field, "hull": field, "msdf": z * CELL}
-    before = ghost_template(subject, state, subject.lattice)
+    surface = surface_of(hull, z * CELL)
+    before = ghost_template(subject, surface)
     hole = 0.3 - np.linalg.norm(subject.lattice.vertex_positions(), axis=1)
-    carved = state | {"sdf": np.maximum(field, hole).astype(np.float32)}
-    after = ghost_template(subject, carved, subject.lattice, like=before)
+    carved = surface.with_fields(sdf=np.maximum(surface.fields.sdf, hole).astype(np.float32))
+    after = ghost_template(subject, carved, like=before)
     inner = np.abs(after.vertices).max(axis=1) < 0.45
     assert inner.any() and after.solid[inner].all()
     np.testing.assert_array_equal(after.solid[~inner], after.vertices[~inner, 2] > 0)
 
 
-def test_the_shape_may_have_had_another_lattice():
-    """As that of a fit with --grid or --resolution has that is resumed: it comes from the scene's file."""
+def test_the_shape_may_have_another_lattice_and_stays_as_it_is():
+    """As that of a fit with --grid or --resolution has: it comes from the scene's file."""
     subject = mi.load_dict({"type": "gshell", "resolution": 12})
-    lattice = make_lattice("cube", RESOLUTION)
-    field = hull_of(RESOLUTION)[0].ravel().astype(np.float32)
-    state = {"sdf": field, "hull": field, "msdf": np.full_like(field, 2 * CELL)}
-    found = ghost_template(subject, state, lattice)
-    assert subject.lattice == lattice
+    lattice, hull = subject.lattice, hull_of(RESOLUTION)[0]
+    found = ghost_template(subject, surface_of(hull, np.full_like(hull, 2 * CELL), "cube"))
+    assert subject.lattice is lattice
     np.testing.assert_allclose(found.logits, 2, rtol=1e-5)
 
 

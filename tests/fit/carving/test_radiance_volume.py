@@ -19,7 +19,8 @@ def seen():
 def make(seen, first=0):
     views, pixels, _ = seen
     hull, vertices, faces = hull_of(32)
-    return RadianceVolume(hull, vertices, faces, mi.ScalarTransform4f(), views, pixels, CONFIG, first)
+    return RadianceVolume(hull, vertices, faces, mi.ScalarTransform4f(), views, pixels, CONFIG.cavities,
+                          first)
 
 
 def march(volume, rays, **options):
@@ -29,7 +30,8 @@ def march(volume, rays, **options):
 def test_no_ray_meets_the_hull(seen):
     views, pixels, _ = seen
     hull, vertices, faces = hull_of(32)
-    volume = RadianceVolume(hull, vertices + 50, faces, mi.ScalarTransform4f(), views, pixels, CONFIG)
+    volume = RadianceVolume(hull, vertices + 50, faces, mi.ScalarTransform4f(), views, pixels,
+                            CONFIG.cavities)
     before = volume.opacity()
     assert np.isfinite(list(volume.step(0).values())).all()
     np.testing.assert_array_equal(volume.opacity(), before)
@@ -79,7 +81,7 @@ def test_replay_gives_the_derivative(seen):
 
 def test_a_resumed_run_takes_the_same_steps(seen):
     whole = make(seen)
-    values = [whole.step(i) for i in range(CONFIG.carving_iterations)]
+    values = [whole.step(i) for i in range(CONFIG.cavities.iterations)]
     for stop in (3, whole.coarse_steps, whole.coarse_steps + 4):
         first = make(seen)
         for i in range(stop):
@@ -92,7 +94,7 @@ def test_a_resumed_run_takes_the_same_steps(seen):
 
 def test_it_thins_in_the_cup_and_not_in_its_walls(seen):
     volume = make(seen)
-    losses = [volume.step(i)["loss"] for i in range(CONFIG.carving_iterations)]
+    losses = [volume.step(i)["loss"] for i in range(CONFIG.cavities.iterations)]
     assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
     opacity, visible = volume.opacity(), volume.seen()
     within, bottom = (16, 21, 16), (16, 15, 16)

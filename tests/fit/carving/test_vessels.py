@@ -1,17 +1,14 @@
 """A cup's mouth leads into a hollow, and is no opening; that of a box of cloth is one."""
 
-from dataclasses import replace
-
 import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from cup import CONFIG, HALF, WALL, block, capture, cup
+from cup import CONFIG, HALF, WALL, block, cup, fit_of, surface_of
 from scipy.spatial import cKDTree
 
 from gshell_mi.fit.carving.vessels import hollowed_vessels
 from gshell_mi.fit.ghost.ghost_template import ghost_template
-from gshell_mi.fit.ghost.pixels import PixelPool
 from gshell_mi.topology import topology
 from gshell_mi.triangles import positive_part
 
@@ -43,17 +40,13 @@ def opened_from_above(points: np.ndarray, half: float, wall: float, x: float = 0
     return np.maximum(side, half - 0.5 * CELL - points[:, 1])
 
 
-def vessels(shape: trimesh.Trimesh, fields, resolution: int = RESOLUTION, config=CONFIG):
-    """What comes of a state on the lattice: ``fields`` maps points (n, 3) to sdf and msdf."""
+def vessels(shape: trimesh.Trimesh, fields, resolution: int = RESOLUTION,
+            gain: float = CONFIG.cavities.vessel_gain):
+    """What comes of a surface on the lattice: ``fields`` maps points (n, 3) to sdf and msdf."""
     subject = mi.load_dict({"type": "gshell", "resolution": resolution})
-    points = subject.lattice.points(mi.Float).numpy().T
-    sdf, msdf = (field.astype(np.float32) for field in fields(points))
-    state = {"sdf": sdf, "hull": sdf, "msdf": msdf}
-    views, _, targets = capture(shape)
-    held_out = np.arange(len(views)) % 6 == 0
-    known, unknown = (PixelPool(views, targets, np.flatnonzero(chosen)) for chosen in (~held_out, held_out))
-    hollowed = hollowed_vessels(subject, state, subject.lattice, views, known, unknown, config)
-    return hollowed and ghost_template(subject, hollowed, subject.lattice)
+    surface = surface_of(*fields(subject.lattice.points(mi.Float).numpy().T))
+    hollowed = hollowed_vessels(fit_of(subject, shape), surface, gain)
+    return hollowed and ghost_template(subject, hollowed)
 
 
 def block_open_above(points):
@@ -70,10 +63,10 @@ def test_a_cups_mouth_is_no_opening_and_its_inside_where_it_is():
     assert inner.sum() > 300 and np.median(cKDTree(truth).query(found.start[inner])[0]) < 0.7 * CELL
 
 
-@pytest.mark.parametrize(("shape", "gain"), [(box_of_cloth, CONFIG.vessel_gain), (cup, 0.0)],
+@pytest.mark.parametrize(("shape", "gain"), [(box_of_cloth, CONFIG.cavities.vessel_gain), (cup, 0.0)],
                          ids=["cloth", "nothing justified"])
 def test_an_opening_stays(shape, gain):
-    assert vessels(shape(), block_open_above, config=replace(CONFIG, vessel_gain=gain)) is None
+    assert vessels(shape(), block_open_above, gain=gain) is None
 
 
 def test_what_is_closed_stays():
@@ -91,7 +84,7 @@ def test_a_dent_is_no_hollow():
         return np.maximum(block_distance(points, HALF), low - points[:, 1]), block_open_above(points)[1]
 
     shape = block([-HALF, low, -HALF], [HALF] * 3)
-    assert vessels(shape, slab, config=replace(CONFIG, vessel_gain=1e6)) is None
+    assert vessels(shape, slab, gain=1e6) is None
 
 
 def test_only_the_cups_opening_goes_where_there_is_another():

@@ -46,7 +46,8 @@ def test_a_sphere_that_grew(mirror):
     subject, vertices, faces = sphere(mi.ScalarTransform4f().translate([5, 0, 0]).scale(scale))
     centre = np.array([5.0, 0, 0])
     moved = centre + 1.2 * (vertices - centre)
-    fields = recast(subject, vertices, moved, faces, solid(vertices), np.abs(vertices - centre), 0.005,
+    fields = recast(subject, subject.lattice, vertices, moved, faces, solid(vertices),
+                    np.abs(vertices - centre), 0.005,
                     counts(0))
     found = surface(subject, fields)
     radius = np.linalg.norm(found.vertices - centre, axis=1)
@@ -62,7 +63,8 @@ def test_a_sphere_that_grew(mirror):
 def test_the_opening_moves_along():
     subject, vertices, faces = sphere()
     logits = (0.2 - vertices[:, 1]) / CELL
-    fields = recast(subject, vertices, vertices * [1, 1.25, 1], faces, logits, np.ones((len(vertices), 3)),
+    fields = recast(subject, subject.lattice, vertices, vertices * [1, 1.25, 1], faces, logits,
+                    np.ones((len(vertices), 3)),
                     0.005, counts(1))
     found = surface(subject, fields)
     after = topology(found.vertices, found.faces)
@@ -81,7 +83,8 @@ def test_a_sheet_stays_whole_and_in_its_place():
     vertices[:, 2] += top - CELL / 6
     logits = np.where(vertices[:, 2] > top - 0.1 * CELL, 0.5 - np.hypot(*vertices[:, :2].T), -1) / CELL
     subject, *_ = sphere()
-    fields = recast(subject, vertices, vertices, faces, logits, np.ones((len(vertices), 3)), 0.005, counts(1))
+    fields = recast(subject, subject.lattice, vertices, vertices, faces, logits, np.ones((len(vertices),
+                    3)), 0.005, counts(1))
     found = surface(subject, fields)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
@@ -93,7 +96,7 @@ def test_a_sheet_stays_whole_and_in_its_place():
 
 def test_a_collapse_goes_only_as_far_as_the_surface_lasts():
     subject, vertices, faces = sphere()
-    fields = recast(subject, vertices, np.zeros_like(vertices), faces, solid(vertices),
+    fields = recast(subject, subject.lattice, vertices, np.zeros_like(vertices), faces, solid(vertices),
                     np.ones((len(vertices), 3)), 0.005, counts(0))
     radius = np.linalg.norm(surface(subject, fields).vertices, axis=1)
     np.testing.assert_allclose(radius, 0.3 * 0.6, atol=0.1 * CELL)
@@ -142,7 +145,8 @@ def test_a_slit_that_closes_becomes_a_bridge():
     moved[:, 0], moved[:, 1] = radius * np.cos(closed), radius * np.sin(closed) * np.sign(angle)
     cut = topology(*positive_part(vertices, faces, logits))
     assert cut.boundary_loops == 1
-    fields = recast(subject, vertices, moved, faces, logits, np.ones((len(vertices), 3)), 0.005, cut)
+    fields = recast(subject, subject.lattice, vertices, moved, faces, logits, np.ones((len(vertices), 3)),
+                    0.005, cut)
     found = surface(subject, fields)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (2, 0, 1)

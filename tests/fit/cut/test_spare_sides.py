@@ -59,7 +59,8 @@ def test_of_a_sheet_one_side_is_left(thickness):
     assert found.topology.boundary_loops == 1
 
     subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
-    fields = recast(subject, vertices, found.positions, faces, found.logits, np.ones((len(vertices), 3)),
+    fields = recast(subject, subject.lattice, vertices, found.positions, faces, found.logits,
+                    np.ones((len(vertices), 3)),
                     0.005, found.topology, found.fewest_loops)
     closed = LatticeFields.closed(fields["sdf"])
     subject.set_fields(LatticeFields(closed.sdf, fields["msdf"], closed.deform))

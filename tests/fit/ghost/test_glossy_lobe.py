@@ -5,11 +5,11 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from gshell_mi.fit.config import FitConfig
 from gshell_mi.fit.ghost.glossy_lobe import _HEIGHT, _NODES, initial_lobe, mirrored_radiance
 from gshell_mi.fit.ghost.pixels import PixelPool
-from gshell_mi.fit.ghost.radiance_ghost import RadianceGhost
+from gshell_mi.fit.ghost.radiance_ghost import RadianceConfig, RadianceGhost
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement
+from gshell_mi.fit.stages.refinement import RefinementConfig
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
 
@@ -56,8 +56,8 @@ def test_the_surroundings_have_no_seam():
 
 RADIUS, SIZE = 0.5, 48
 CELL = 2 / 32
-CONFIG = FitConfig(ghost_batch=8192, ghost_smoothing=1.0, refinement_iterations=80, refinement_smoothing=6.3,
-                   refinement_detail=3.1, refinement_lr=0.2)
+RADIANCE = RadianceConfig(batch=8192, smoothing=1.0)
+CONFIG = RefinementConfig(iterations=80, smoothing=6.3, detail=3.1, lr=0.2)
 
 
 def cameras() -> list[mi.Sensor]:
@@ -94,11 +94,11 @@ def test_highlights_pull_the_surface_inwards_far_less():
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     offsets = {}
     for glossy in (False, True):
-        ghost = RadianceGhost(vertices, faces, views, pixels, CONFIG, glossy=glossy)
+        ghost = RadianceGhost(vertices, faces, views, pixels, RADIANCE, glossy=glossy)
         for _ in range(3):
             ghost.refit(np.ones(len(vertices), bool))
         refinement = PhotometricRefinement(ghost, vertices, faces, None, CELL, CONFIG)
-        for step in range(CONFIG.refinement_iterations):
+        for step in range(CONFIG.iterations):
             refinement.step(step)
         offsets[glossy] = (np.linalg.norm(refinement.positions(), axis=1) - RADIUS).mean() / CELL
     assert offsets[False] < -0.2

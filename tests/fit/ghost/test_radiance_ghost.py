@@ -9,14 +9,15 @@ import pytest
 import trimesh
 from bowl import RADIUS, half_sphere
 
-from gshell_mi.fit.config import FitConfig
 from gshell_mi.fit.ghost.pixels import PixelPool
-from gshell_mi.fit.ghost.radiance_ghost import RadianceGhost
+from gshell_mi.fit.ghost.radiance_ghost import RadianceConfig, RadianceGhost
+from gshell_mi.fit.stages.openings import OpacityTraining, OpeningsConfig
 from gshell_mi.scene import load_fit_scene
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
 
-CONFIG = FitConfig(ghost_batch=4096, ghost_smoothing=1.0, ghost_iterations=60)
+CONFIG = RadianceConfig(batch=4096, smoothing=1.0)
+TRAINING = OpeningsConfig(iterations=60)
 
 
 def logit(x):
@@ -96,7 +97,7 @@ def test_what_no_ray_meets_keeps_its_radiance():
 
 
 def test_only_the_first_sheets_count():
-    ghost = RadianceGhost(*two_sheets(), *unused_views(), dataclasses.replace(CONFIG, ghost_sheets=1))
+    ghost = RadianceGhost(*two_sheets(), *unused_views(), dataclasses.replace(CONFIG, layers=1))
     _, alpha = composite(ghost, [0.1, 0.2, 5], [0, 0, -1])
     assert alpha == pytest.approx(0.35, abs=1e-5), "where every vertex starts"
 
@@ -171,7 +172,8 @@ def test_training_tells_the_lid_from_the_bowl(bowl_scene):
     views = PinholeViews.from_sensors(fit.sensors)
     vertices, faces, lid = lidded_bowl()
     ghost = RadianceGhost(vertices, faces, views, PixelPool(views, fit.targets), CONFIG)
-    losses = [ghost.step(i)["image"] for i in range(CONFIG.ghost_iterations)]
+    training = OpacityTraining(ghost, TRAINING)
+    losses = [training.step(i)["image"] for i in range(TRAINING.iterations)]
     assert np.mean(losses[-10:]) < 0.65 * np.mean(losses[:10])
     logits = ghost.smoothed_logits()
     inner = lid & (np.linalg.norm(vertices, axis=1) < 0.7 * RADIUS)

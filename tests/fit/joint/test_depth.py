@@ -110,13 +110,13 @@ def test_millimetres_in_a_scene_of_metres(scene):
         check_depth(replace(fit, targets=targets), views)
 
 
-def stage(fit, radius: float, **config) -> JointStage:
+def stage(fit, radius: float, settings: dict | None = None) -> JointStage:
     lattice = fit.subject.lattice
     points = lattice.vertex_positions()
     fit.subject.set_fields(LatticeFields.closed(np.linalg.norm(points, axis=1) - radius))
     material = MaterialField(np.full((lattice.vertex_count, 3), 0.5))
-    none = dict.fromkeys(("joint_mask", "material_smoothness", "light_grey"), 0.0)
-    return JointStage(fit, material, None, FitConfig(**none | config))
+    none = dict.fromkeys(("losses.mask", "losses.material_smoothness", "losses.light_grey"), 0.0)
+    return JointStage(fit, material, None, FitConfig().changed(none | (settings or {})))
 
 
 def test_the_loss_is_the_difference_in_cells(scene):
@@ -125,8 +125,8 @@ def test_the_loss_is_the_difference_in_cells(scene):
     joint = stage(fit, RADIUS - 0.05)
     joint.apply(geometry=True)
     _, terms = joint._regularisers([8])
-    assert terms["joint_depth"][0] == pytest.approx(0.5, abs=0.05)
-    without = joint._regularisers([2])[1]["joint_depth"]
+    assert terms["depth"][0] == pytest.approx(0.5, abs=0.05)
+    without = joint._regularisers([2])[1]["depth"]
     assert without[0] == 0, "a view without a map"
     error = depth_error(fit, PinholeViews.from_sensors(fit.sensors), joint.scene)
     assert error == pytest.approx(0.05 * 2**0.5, abs=0.005)
@@ -138,7 +138,7 @@ def test_the_derivative_moves_the_surface_towards_the_map(scene):
 
     joint = stage(fit, RADIUS - 0.05)
     joint.apply(geometry=True)
-    dr.backward(joint._regularisers([8])[1]["joint_depth"])
+    dr.backward(joint._regularisers([8])[1]["depth"])
     assert -dr.sum(dr.grad(joint.fields["sdf"]))[0] == pytest.approx(-10, rel=0.03)
 
 
@@ -149,6 +149,6 @@ def test_depth_is_measured_at_the_end(scene, tmp_path):
     metrics = json.loads((output / "metrics.json").read_text())
     assert 0 < metrics["depth_error"] < 0.1
     step = json.loads((output / "log.jsonl").read_text().splitlines()[-1])
-    assert "joint_depth" in step
+    assert "depth" in step
     assert set(metrics["diagnostics"]) >= {"pieces", "floaters", "pinholes", "self_contact", "unobserved"}
     assert isinstance(metrics["warnings"], list)

@@ -6,33 +6,36 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from gshell_mi import extras  # noqa: F401 registers losses
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.joint.joint import JointStage
-from gshell_mi.fit.start import start_light, start_material
+from gshell_mi.fit.stages.joint import start_light, start_material
+from gshell_mi.fit.surface import Seen, Surface
 from gshell_mi.lattice import make_lattice
 from gshell_mi.scene import load_fit_scene
 
 #: Losses over the surface, whose size changes, that the defaults leave out.
 LOSSES = {"hole_opening": 1e-3, "hole_closing": 1e-3, "sdf_sign": 1e-3, "eikonal": 1e-3,
           "template_smoothness": 1e-3}
-CONFIG = FitConfig(iterations=100, step_views=2, warmup=0, geometry_lr=0.6, spp=2, primal_spp=2,
-                   light_height=8, band_resolution=99)
+CONFIG = FitConfig(iterations=100, band_resolution=99).changed({
+    "joint.warmup": 0.0, "joint.geometry_lr": 0.6, "render.views": 2, "render.spp": 2, "render.primal_spp": 2,
+    "model.light_height": 8})
 
 
 @pytest.mark.parametrize(("grid", "settings"),
-                         [("flexicubes", {}), ("tet", {}), ("flexicubes", LOSSES),
-                          ("flexicubes", {"reparam_depth": 2})],
+                         [("flexicubes", {}), ("tet", {}), ("flexicubes", {"losses.extra": LOSSES}),
+                          ("flexicubes", {"render.reparam_depth": 2})],
                          ids=["flexicubes", "tet", "losses", "shadows"])
 def test_a_step_compiles_nothing(bowl_scene, grid, settings):
-    lattice, config = make_lattice(grid, 18), replace(CONFIG, **settings)
+    lattice, config = make_lattice(grid, 18), CONFIG.changed(settings)
     fit = load_fit_scene(bowl_scene)
     points = lattice.vertex_positions()
     closed = LatticeFields.closed((np.linalg.norm(points, axis=1) - 0.6).astype(np.float32), grid)
     fit.subject.set_fields(replace(closed, msdf=(0.1 - points[:, 1]).astype(np.float32)))
-    seen = {"radiance": np.full((len(points), 3), 0.3, np.float32), "known": np.full(len(points), True),
-            "light": np.float32(0.5)}
-    material, light = start_material(fit, seen, lattice, config), start_light(fit, seen, config)
+    seen = Seen(np.full((len(points), 3), 0.3, np.float32), np.full(len(points), True), np.float32(0.5))
+    surface = Surface(closed, seen=seen)
+    material, light = start_material(fit, surface, lattice, config), start_light(fit, surface, config)
     joint = JointStage(fit, material, light, config)
 
     counts, launched, compiled = set(), 0, []

@@ -12,14 +12,16 @@ from bowl import RADIUS, sensors_xml
 from gshell_mi.fields import sphere
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.joint.joint import JointStage
-from gshell_mi.fit.start import TYPICAL_REFLECTANCE, start_light, start_material
+from gshell_mi.fit.stages.joint import start_light, start_material
+from gshell_mi.fit.surface import TYPICAL_REFLECTANCE, Seen, Surface
 from gshell_mi.lattice import TetLattice
 from gshell_mi.scene import load_fit_scene
 
 LATTICE = TetLattice(12)
 SUN = np.array([0.6, 0.64, 0.48])
-CONFIG = FitConfig(iterations=60, warmup=1.0, spp=4, primal_spp=4, max_depth=2, light_height=8,
-                   band_resolution=99)
+CONFIG = FitConfig(iterations=60, band_resolution=99).changed({
+    "joint.warmup": 1.0, "render.spp": 4, "render.primal_spp": 4, "render.max_depth": 2,
+    "model.light_height": 8})
 
 
 def directions(height: int) -> np.ndarray:
@@ -59,12 +61,13 @@ def fit(tmp_path_factory):
 
 
 @pytest.fixture
-def seen() -> dict[str, np.ndarray]:
+def seen() -> Surface:
     """What earlier stages have left of a ball that is lit from the sun's side."""
     points = LATTICE.vertex_positions()
     lit = 0.1 + np.maximum(points @ SUN, 0) / np.linalg.norm(points + 1e-9, axis=1)
-    return {"radiance": np.repeat(lit[:, None], 3, axis=1), "known": np.full(len(points), True),
-            "light": np.float32(np.median(lit) / TYPICAL_REFLECTANCE)}
+    light = np.float32(np.median(lit) / TYPICAL_REFLECTANCE)
+    return Surface(sphere(LATTICE, RADIUS), seen=Seen(np.repeat(lit[:, None], 3, axis=1),
+                                                      np.full(len(points), True), light))
 
 
 def start(fit, seen, config: FitConfig) -> JointStage:
@@ -77,15 +80,15 @@ def test_it_starts_with_one_colour(fit, seen):
     np.testing.assert_allclose(color, TYPICAL_REFLECTANCE, rtol=1e-4)
 
 
-@pytest.mark.parametrize("settings", [{"even_start": False}, {"known_light": True}])
+@pytest.mark.parametrize("settings", [{"model.even_start": False}, {"known_light": True}])
 def test_or_with_what_was_seen(fit, seen, settings):
-    config = replace(CONFIG, **settings)
+    config = CONFIG.changed(settings)
     color = start_material(fit, seen, LATTICE, config).values()["vertex_color"].numpy().reshape(-1, 3)
-    np.testing.assert_allclose(color, np.clip(seen["radiance"] / seen["light"], 0.02, 0.98), rtol=1e-4)
+    np.testing.assert_allclose(color, np.clip(seen.seen.radiance / seen.seen.light, 0.02, 0.98), rtol=1e-4)
 
 
 def test_the_light_moves_first(fit, seen):
-    joint = start(fit, seen, replace(CONFIG, iterations=10, color_hold=0.8))
+    joint = start(fit, seen, CONFIG.changed({"iterations": 10, "joint.color_hold": 0.8}))
     sought = ((joint.material_optimizer, "vertex_color"), (joint.material_optimizer, "vertex_roughness"),
               (joint.light_optimizer, "log_radiance"))
     values = [[optimizer[name].numpy() for optimizer, name in sought]]
@@ -94,14 +97,14 @@ def test_the_light_moves_first(fit, seen):
         values.append([optimizer[name].numpy() for optimizer, name in sought])
     color, roughness, light = ([np.abs(after[i] - before[i]).max() for before, after in pairwise(values)]
                                for i in range(3))
-    assert color[0] == 0 and light[0] == pytest.approx(CONFIG.light_lr, rel=1e-3)
+    assert color[0] == 0 and light[0] == pytest.approx(CONFIG.joint.light_lr, rel=1e-3)
     assert color[7] > 5 * color[1]
-    assert roughness[0] == pytest.approx(CONFIG.material_lr, rel=1e-3)
+    assert roughness[0] == pytest.approx(CONFIG.joint.material_lr, rel=1e-3)
 
 
 def test_a_colour_that_is_no_number_stays_alone(fit, seen):
     """Derivatives that it spoils, as slivers do, go no farther; the optimisers would never be rid of them."""
-    joint = start(fit, seen, replace(CONFIG, warmup=0.0, color_hold=0.0))
+    joint = start(fit, seen, CONFIG.changed({"joint.warmup": 0.0, "joint.color_hold": 0.0}))
     before = joint.light_optimizer["log_radiance"].numpy()
     color = joint.material_optimizer["vertex_color"].numpy().reshape(-1, 3)
     points = LATTICE.vertex_positions()
@@ -121,7 +124,8 @@ def test_a_material_under_a_given_light_need_not_wait(fit, seen):
     joint = start(fit, seen, replace(CONFIG, known_light=True))
     before = joint.material_optimizer["vertex_color"].numpy()
     joint.step(0)
-    assert np.abs(joint.material_optimizer["vertex_color"].numpy() - before).max() > 0.5 * CONFIG.material_lr
+    after = joint.material_optimizer["vertex_color"].numpy()
+    assert np.abs(after - before).max() > 0.5 * CONFIG.joint.material_lr
 
 
 def test_the_sun_is_found_and_not_painted(fit, seen):
@@ -132,7 +136,7 @@ def test_the_sun_is_found_and_not_painted(fit, seen):
         color = joint.subject.surface.interpolate(joint.material.values()["vertex_color"], 3).numpy()
     assert color.std() / color.mean() < 0.15
     radiance = joint.light.radiance.numpy().mean(axis=2)
-    toward = directions(CONFIG.light_height)
+    toward = directions(CONFIG.model.light_height)
     brightest = toward.reshape(-1, 3)[radiance.argmax()]
     assert np.degrees(np.arccos(brightest @ SUN)) < 25
     solid_angles = np.broadcast_to(joint.light.solid_angles.numpy()[..., 0], radiance.shape)

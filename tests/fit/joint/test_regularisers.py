@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from bowl import RADIUS
 
-from gshell_mi import losses
+from gshell_mi import extras, losses  # noqa: F401 the former registers losses
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.joint.joint import JointStage
@@ -17,8 +17,9 @@ from gshell_mi.material import MaterialField
 from gshell_mi.scene import load_fit_scene
 
 #: The joint stage's own weights, all 0.
-NONE = FitConfig(material_smoothness=0, light_grey=0, flexicubes_deviation=0, spp=1, primal_spp=1,
-                 max_depth=2, light_height=4, iterations=4)
+NONE = FitConfig(iterations=4).changed({
+    "losses.material_smoothness": 0.0, "losses.light_grey": 0.0, "losses.flexicubes_deviation": 0.0,
+    "render.spp": 1, "render.primal_spp": 1, "render.max_depth": 2, "model.light_height": 4})
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,8 @@ def stage(fit, *, top: float = 0.0, radius: float = RADIUS, noise: float = 0.0, 
     fields = LatticeFields.closed(sdf)
     fit.subject.set_fields(replace(fields, msdf=(top - points[:, 1]).astype(np.float32)))
     material = MaterialField(np.full((lattice.vertex_count, 3), 0.5))
-    return JointStage(fit, material, EnvironmentLight.uniform(4, 1.0), replace(NONE, **weights))
+    config = NONE.changed({"losses.extra": weights})
+    return JointStage(fit, material, EnvironmentLight.uniform(4, 1.0), config)
 
 
 def gradients(joint: JointStage, view: int = 0) -> tuple[dict[str, float], dict[str, np.ndarray]]:
@@ -75,7 +77,7 @@ def test_the_sum_is_weighted(fit):
 def test_terms_are_logged(fit):
     log = stage(fit, eikonal=0.1).step(3)
     assert log["eikonal"] > 0
-    assert log["loss"] == pytest.approx(log["image"] + NONE.joint_mask * log["mask"] + 0.1 * log["eikonal"])
+    assert log["loss"] == pytest.approx(log["image"] + NONE.losses.mask * log["mask"] + 0.1 * log["eikonal"])
 
 
 def test_hole_opening_lowers_the_msdf_of_the_surface_only(fit):

@@ -51,13 +51,13 @@ class StillJoint:
     """A joint stage whose steps change nothing."""
 
     def __init__(self, config: FitConfig):
-        self.config = config
+        self.config, self.stage, self.iterations = config, config.joint, config.iterations
         self.subject = mi.load_dict({"type": "gshell", "resolution": LATTICE.resolution})
         fields = sphere(LATTICE, RADIUS)
         self.subject.set_fields(replace(fields, msdf=(0.45 - fields.lattice.vertex_positions()[:, 2])
                                         .astype(np.float32)))
         self._msdf = self.subject.msdf
-        self.geometry = SimpleNamespace(replace=self._replace, held=None)
+        self.geometry = SimpleNamespace(replace=self._replace, held=None, is_explicit=True)
         self.scene = self.integrator = None
 
     def _replace(self, name, field):
@@ -76,7 +76,7 @@ class StillJoint:
     def finish(self):
         self.apply(geometry=True)
         self.subject.msdf = without_specks(self.subject.msdf, self.subject.template(), LATTICE,
-                                           self.config.ghost_min_area)
+                                           self.config.min_area)
         self.subject.set_fields(self.subject.fields())
 
     def seed(self, iteration):
@@ -114,7 +114,7 @@ def evidence_above(monkeypatch):
     return said
 
 
-CONFIG = FitConfig(iterations=8, second_look=0.0, second_look_gain=0.9)
+CONFIG = FitConfig(iterations=8).changed({"joint.revision": 0.0, "joint.revision_gain": 0.9})
 
 
 def run(joint: StillJoint, steps: range, state: dict | None = None) -> SecondLook:
@@ -153,9 +153,9 @@ def test_what_has_grown_rests_until_it_is_judged(evidence_above):
     joint.geometry.held, state = None, worker.state()
     worker = run(joint, range(1, 4), state)
     np.testing.assert_array_equal(joint.geometry.held.numpy(), held)
-    np.testing.assert_array_equal(worker.state()["second_look/held"], held)
+    np.testing.assert_array_equal(worker.state()["held"], held)
     worker = run(joint, range(4, 5), worker.state())
-    assert joint.geometry.held is None and "second_look/held" not in worker.state()
+    assert joint.geometry.held is None and "held" not in worker.state()
 
 
 def test_specks_grow_with_the_opening_that_they_belong_to(evidence_above):
@@ -189,7 +189,7 @@ def test_growth_that_led_to_other_loops_is_taken_back(evidence_above):
     """As if it should have taken one away, which only undoing it makes right."""
     evidence_above["later"] = 0.5
     joint = StillJoint(CONFIG)
-    state = run(joint, range(8)).state() | {"second_look/spent": np.array([[1, 0]])}
+    state = run(joint, range(8)).state() | {"spent": np.array([[1, 0]])}
     assert run(joint, range(0), state).finish() is False
     assert joint.loops() == 1 and joint.height() == pytest.approx(0.45, abs=1.5 * LATTICE.spacing)
 
@@ -250,7 +250,7 @@ def test_what_comes_apart_on_a_finer_lattice_is_joined(evidence_above):
     evidence_above["later"] = 0.5
     worker = run(StillJoint(CONFIG), range(8))
     assert worker.finish() is True
-    joint, (x, _, z) = StillJoint(replace(CONFIG, second_look=1.0)), LATTICE.vertex_positions().T
+    joint, (x, _, z) = StillJoint(CONFIG.changed({"joint.revision": 1.0})), LATTICE.vertex_positions().T
     joint.cut((x > 0.2) & (z > 0.25) & (z < 0.35))
     joint.apply(geometry=True)
     assert joint.loops() == 2

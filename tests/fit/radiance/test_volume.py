@@ -8,16 +8,16 @@ import pytest
 from bowl import RADIUS
 
 from gshell_mi.fields.visual_hull import visual_hull
-from gshell_mi.fit import FitConfig
 from gshell_mi.fit.bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
 from gshell_mi.fit.ghost.pixels import PixelPool
+from gshell_mi.fit.radiance.config import VolumeConfig
 from gshell_mi.fit.radiance.volume import RadianceVolume
 from gshell_mi.fit.radiance.volume_surface import volume_surface
 from gshell_mi.lattice import make_lattice
 from gshell_mi.scene import FitScene, load_fit_scene
 from gshell_mi.views import PinholeViews
 
-CONFIG = FitConfig(volume_iterations=90, volume_side=48, volume_batch=16384)
+CONFIG = VolumeConfig(iterations=90, side=48, batch=16384)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def scene(bowl_scene) -> FitScene:
     return load_fit_scene(bowl_scene)
 
 
-def _volume(scene: FitScene, config: FitConfig = CONFIG, stored=None) -> RadianceVolume:
+def _volume(scene: FitScene, config: VolumeConfig = CONFIG, stored=None) -> RadianceVolume:
     views = PinholeViews.from_sensors(scene.sensors)
     side = RadianceVolume.first_side(config)
     centre = (np.arange(side, dtype=np.float32) + 0.5) * (2 / side) - 1
@@ -40,15 +40,15 @@ def _volume(scene: FitScene, config: FitConfig = CONFIG, stored=None) -> Radianc
 @pytest.fixture(scope="module")
 def trained(scene) -> RadianceVolume:
     volume = _volume(scene)
-    volume.losses = [volume.step(iteration) for iteration in range(CONFIG.volume_iterations)]
+    volume.losses = [volume.step(iteration) for iteration in range(CONFIG.iterations)]
     return volume
 
 
 def test_it_learns_from_coarse_to_fine(trained):
     losses = [step["image"] for step in trained.losses]
     assert np.mean(losses[-10:]) < 0.4 * np.mean(losses[:10])
-    assert trained.bricks.side == CONFIG.volume_side
-    assert trained.bricks.voxel_count < 0.5 * CONFIG.volume_side**3, "empty space has no voxels"
+    assert trained.bricks.side == CONFIG.side
+    assert trained.bricks.voxel_count < 0.5 * CONFIG.side**3, "empty space has no voxels"
 
 
 def test_its_depth_is_that_of_the_bowl(scene, trained):
@@ -60,7 +60,7 @@ def test_its_depth_is_that_of_the_bowl(scene, trained):
         points = np.array(ray.o).T + depth[:, None] * np.array(ray.d).T
         seen = np.isfinite(depth) & (scene.targets[view].rgba[..., 3].ravel() > 0.99)
         errors.append(np.abs(np.linalg.norm(points[seen], axis=1) - RADIUS))
-    assert np.median(np.concatenate(errors)) < 1.5 * 2 / CONFIG.volume_side
+    assert np.median(np.concatenate(errors)) < 1.5 * 2 / CONFIG.side
 
 
 def test_its_surface_is_near_the_bowl(scene, trained):
@@ -73,7 +73,7 @@ def test_its_surface_is_near_the_bowl(scene, trained):
 
 
 def test_it_goes_on_where_it_stopped(scene):
-    config = dataclasses.replace(CONFIG, volume_iterations=20)
+    config = dataclasses.replace(CONFIG, iterations=20)
     whole, first = _volume(scene, config), _volume(scene, config)
     for iteration in range(20):
         whole.step(iteration)

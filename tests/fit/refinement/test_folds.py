@@ -1,18 +1,17 @@
 """The second round of the refinement: kept where unseen views gain by it, dropped where not."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from bowl import CLOSED, SHORT
 
-from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.refinement.descent import Descent
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement
+from gshell_mi.fit.stages.refinement import FoldsConfig, RefinementConfig
 
-TWO_ROUNDS = (*SHORT, *CLOSED, "--folds-iterations", "4", "--folds-descent", "1000", "--iterations", "0")
+TWO_ROUNDS = (*SHORT, *CLOSED, "--folds.iterations", "4", "--folds.descent", "1000", "--iterations", "0")
 
 
 def run(scene, output, *arguments):
@@ -30,24 +29,20 @@ def rounds(first, second):
 
 
 def test_it_goes_on_where_the_first_round_has_ended():
-    before = FitConfig(refinement_detail=20.0, folds_iterations=7, folds_lr=0.4, folds_detail=5.0)
-    after = before.for_folds()
-    assert (after.refinement_iterations, after.refinement_lr) == (7, 0.4)
-    assert (after.refinement_smoothing, after.refinement_detail) == (20, 5)
-    assert replace(after, refinement_iterations=before.refinement_iterations, refinement_detail=20.0,
-                   refinement_lr=before.refinement_lr,
-                   refinement_smoothing=before.refinement_smoothing) == before
+    first, second = RefinementConfig(), FoldsConfig()
+    assert second.smoothing == first.detail
+    assert second.lr > first.lr and second.detail < first.detail
 
 
 @pytest.mark.parametrize(("gain", "kept"), [("0", False), ("1000", True)])
 def test_metrics_say_whether_it_was_kept(bowl_scene, tmp_path, gain, kept):
-    metrics = run(bowl_scene, tmp_path, "--refinement-gain", "1000", "--folds-gain", gain)
+    metrics = run(bowl_scene, tmp_path, "--refinement.gain", "1000", "--folds.gain", gain)
     assert (metrics["refinement_kept"], metrics["folds_kept"]) == (True, kept)
     assert steps(tmp_path) == rounds(2, 4) and metrics["seconds"]["folds"] > 0
 
 
-@pytest.mark.parametrize("arguments", [("--refinement-gain", "0"),
-                                       ("--refinement-gain", "1000", "--folds-iterations", "0")],
+@pytest.mark.parametrize("arguments", [("--refinement.gain", "0"),
+                                       ("--refinement.gain", "1000", "--folds.iterations", "0")],
                          ids=["first round dropped", "off"])
 def test_there_may_be_none(bowl_scene, tmp_path, arguments):
     assert "folds_kept" not in run(bowl_scene, tmp_path, *arguments)
@@ -59,7 +54,7 @@ def ended_within_it(scene, output, monkeypatch, *arguments):
     step = PhotometricRefinement.step
 
     def ends(self, iteration):
-        if self.config.refinement_lr == FitConfig().folds_lr and iteration == 2:
+        if isinstance(self.config, FoldsConfig) and iteration == 2:
             raise MemoryError
         return step(self, iteration)
 
@@ -70,14 +65,14 @@ def ended_within_it(scene, output, monkeypatch, *arguments):
 
 
 def test_ended_within_it_and_resumed(bowl_scene, tmp_path, monkeypatch):
-    arguments = ("--refinement-gain", "1000", "--folds-gain", "1000", "--checkpoint-seconds", "0")
+    arguments = ("--refinement.gain", "1000", "--folds.gain", "1000", "--checkpoint-seconds", "0")
     ended_within_it(bowl_scene, tmp_path, monkeypatch, *arguments)
     metrics = run(bowl_scene, tmp_path, *arguments, "--resume")
     assert steps(tmp_path) == rounds(2, 4) and metrics["folds_kept"]
 
 
-STALLS = ("--refinement-gain", "1000", "--folds-gain", "1000", "--folds-iterations", "16",
-          "--folds-descent", "0")
+STALLS = ("--refinement.gain", "1000", "--folds.gain", "1000", "--folds.iterations", "16",
+          "--folds.descent", "0")
 
 
 def test_it_ends_after_a_quarter_where_the_error_does_not_fall(bowl_scene, tmp_path):

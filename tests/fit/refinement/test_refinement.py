@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from gshell_mi.fit.config import FitConfig
 from gshell_mi.fit.ghost.pixels import PixelPool
-from gshell_mi.fit.ghost.radiance_ghost import RadianceGhost
+from gshell_mi.fit.ghost.radiance_ghost import RadianceConfig, RadianceGhost
 from gshell_mi.fit.ghost.sheets import Sheet
 from gshell_mi.fit.refinement.outlines import Outlines
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement, _barycentric
+from gshell_mi.fit.stages.refinement import RefinementConfig
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
 
 RADIUS, SIZE = 0.5, 48
-CONFIG = FitConfig(ghost_batch=8192, ghost_smoothing=1.0, refinement_iterations=60, refinement_smoothing=6.3,
-                   refinement_detail=1.6, refinement_lr=0.3)
+RADIANCE = RadianceConfig(batch=8192, smoothing=1.0)
+CONFIG = RefinementConfig(iterations=60, smoothing=6.3, detail=1.6, lr=0.3)
 CELL = 2 / 32
 
 
@@ -62,7 +62,7 @@ def alphas(targets: list[Target]) -> list[np.ndarray]:
 def refinement(capture, vertices, faces, with_outlines) -> PhotometricRefinement:
     views, pixels, targets = capture
     solid = np.ones(len(vertices), bool)
-    ghost = RadianceGhost(vertices, faces, views, pixels, CONFIG)
+    ghost = RadianceGhost(vertices, faces, views, pixels, RADIANCE)
     ghost.refit(solid)
     outlines = Outlines(views, alphas(targets), faces, solid) if with_outlines else None
     return PhotometricRefinement(ghost, vertices, faces, outlines, CELL, CONFIG)
@@ -81,7 +81,7 @@ def test_bump_goes_down_without_outlines(capture):
     before = np.linalg.norm(vertices, axis=1) - RADIUS
     fit = refinement(capture, vertices, faces, with_outlines=False)
     first = fit.step(0)["image"]
-    for step in range(1, CONFIG.refinement_iterations):
+    for step in range(1, CONFIG.iterations):
         last = fit.step(step)["image"]
     after = np.linalg.norm(fit.positions(), axis=1) - RADIUS
     high = before > 0.5 * CELL
@@ -98,7 +98,7 @@ def test_outline_of_the_true_sphere_is_the_masks(capture):
 
     def distance(scale: float) -> float:
         vertices = scale * np.array(mesh.vertices)
-        ghost = RadianceGhost(vertices, faces, views, capture[1], CONFIG)
+        ghost = RadianceGhost(vertices, faces, views, capture[1], RADIANCE)
         outlines = Outlines(views, alphas(targets), faces, np.ones(len(vertices), bool))
         loss = outlines.loss(mi.Float(vertices.ravel()), ghost.scene, np.arange(len(views)))
         return float(np.sqrt(loss[0])) / pixel
@@ -113,7 +113,7 @@ def test_outline_loss_derivative_is_that_of_a_scaled_sphere(capture):
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=1.05 * RADIUS)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     outlines = Outlines(views, alphas(targets), faces, np.ones(len(vertices), bool))
-    ghost = RadianceGhost(vertices, faces, views, pixels, CONFIG)
+    ghost = RadianceGhost(vertices, faces, views, pixels, RADIANCE)
     every = np.arange(len(views))
 
     def loss(scale):
@@ -150,7 +150,7 @@ def test_views_it_did_not_see_judge_the_refinement(capture):
     assert set(np.unique(drawn.view)) == set(np.flatnonzero(unseen))
     errors = []
     for points in (vertices, np.array(sphere.vertices)):
-        ghost = RadianceGhost(points, faces, views, known, CONFIG)
+        ghost = RadianceGhost(points, faces, views, known, RADIANCE)
         ghost.refit(np.ones(len(points), bool))
         errors.append(ghost.unexplained(unknown))
     assert errors[1] < 0.95 * errors[0]

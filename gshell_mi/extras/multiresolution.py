@@ -11,9 +11,9 @@ from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import BlockLattice, Lattice
 from ..outliers import trusted
+from ..parametrisation import ExplicitGrid
+from ..parametrisation.parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched
 from ..schedules import decay_at
-from .explicit import ExplicitGrid
-from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched
 
 #: Coarse grids beside the lattice itself: of half its cells per side, a quarter, an eighth.
 _COARSE_LEVELS = 3
@@ -27,7 +27,8 @@ class MultiresolutionGrid(Parametrisation):
     levels start at 0, so the fields start exactly where they are told to.
     """
 
-    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules):
+    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules,
+                 seed: int = 0):
         self.lattice, self.rules = lattice, rules
         sizes = (max(lattice.resolution >> level, 1) + 1 for level in range(1, _COARSE_LEVELS + 1))
         self._sizes = list(dict.fromkeys(sizes))

@@ -14,9 +14,9 @@ from ..fields.carried import Carried
 from ..fields.smoothing import LatticeDiffusion
 from ..lattice import BlockLattice, Lattice
 from ..outliers import finite, trusted
+from ..parametrisation import ExplicitGrid
+from ..parametrisation.parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched
 from ..schedules import decay_at
-from .explicit import ExplicitGrid
-from .parametrisation import CHANNELS, Parametrisation, StepRules, taken, touched
 
 #: Outputs of the network: sdf, msdf, deform.
 _OUTPUTS = 5

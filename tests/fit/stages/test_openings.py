@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gshell_mi.fit import FitConfig
-from gshell_mi.fit.ghost.rounds import find_openings
+from gshell_mi.fit.stages.openings import OpeningsConfig, find_openings
 from gshell_mi.topology import equal_patches
 
 BALL = trimesh.creation.icosphere(4)
@@ -19,7 +18,6 @@ class ScriptedGhost:
     """
 
     def __init__(self, first: tuple, false: tuple, behind: tuple):
-        self.config = FitConfig()
         self.false, self.behind = (np.logical_or.reduce([self.cap(axis) for axis in axes], initial=False)
                                    for axes in (false, behind))
         self.open = np.logical_or.reduce([self.cap(axis) for axis in first])
@@ -48,6 +46,10 @@ class ScriptedGhost:
         return np.tile(np.where(opaque, 1.0, through), (2, 1))
 
 
+def found_openings(ghost: ScriptedGhost, **settings) -> np.ndarray:
+    return find_openings(ghost, VERTICES, FACES, OpeningsConfig(**settings), 0.005, ghost.train) <= 0
+
+
 @pytest.mark.parametrize(("false", "behind", "openings", "rounds"), [
     ((), (), 1, 0),
     (((0, 1, 0),), (), 1, 1),
@@ -56,7 +58,7 @@ class ScriptedGhost:
 ])
 def test_rounds_go_on_as_long_as_they_find_openings(false, behind, openings, rounds):
     ghost = ScriptedGhost(((0, 0, 1), *false), false, behind)
-    opened = find_openings(ghost, VERTICES, FACES, ghost.train) <= 0
+    opened = found_openings(ghost)
     assert ghost.rounds == rounds
     assert len(np.unique(equal_patches(opened, FACES)[opened])) == openings
     assert opened[ghost.cap((0, 0, 1))].all(), "what was justified stays"
@@ -65,14 +67,13 @@ def test_rounds_go_on_as_long_as_they_find_openings(false, behind, openings, rou
 
 def test_false_openings_alone_are_reason_enough_for_another_round():
     ghost = ScriptedGhost(((0, 1, 0),), ((0, 1, 0),), ((0, 0, 1),))
-    opened = find_openings(ghost, VERTICES, FACES, ghost.train) <= 0
+    opened = found_openings(ghost)
     np.testing.assert_array_equal(opened, ghost.cap((0, 0, 1)))
 
 
-@pytest.mark.parametrize(("settings", "found"), [({"ghost_rounds": 0}, True), ({"ghost_gain": 0.0}, False)])
+@pytest.mark.parametrize(("settings", "found"), [({"rounds": 0}, True), ({"gain": 0.0}, False)])
 def test_no_rounds_that_are_not_asked_for_or_can_find_nothing(settings, found):
     ghost = ScriptedGhost(((0, 0, 1), (0, 1, 0)), ((0, 1, 0),), ((1, 0, 0),))
-    ghost.config = FitConfig(**settings)
-    opened = find_openings(ghost, VERTICES, FACES, ghost.train) <= 0
+    opened = found_openings(ghost, **settings)
     assert ghost.rounds == 0
     np.testing.assert_array_equal(opened, ghost.cap((0, 0, 1)) & found)

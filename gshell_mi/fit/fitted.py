@@ -1,0 +1,73 @@
+"""What a fit has found, as objects to render and to export."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from ..color_detail import ColorDetail
+from ..diagnostics import diagnose
+from ..light import EnvironmentLight
+from ..material import GivenMaterial, MaterialField, given_material
+from .joint.depth import depth_error
+from .joint.joint import optimised_scene
+from .stage import Fit
+from .stages.joint import start_light
+from .surface import Surface
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The end of a fit; the scene's gshell shape is its surface.
+
+    Attributes:
+        material: on the surface's lattice.
+        light: None if it is the scene's own.
+        detail: of the base colour; None if there is none.
+        scene: of the surface under that light.
+    """
+
+    material: MaterialField | GivenMaterial
+    light: EnvironmentLight | None
+    detail: ColorDetail | None
+    scene: mi.Scene
+
+    @classmethod
+    def of(cls, fit: Fit, surface: Surface) -> Fitted:
+        """What a surface after the last stage stands for."""
+        subject, config = fit.scene.subject, fit.config
+        subject.set_fields(surface.fields)
+        given, count = given_material(fit.scene.bsdf), surface.lattice.vertex_count
+        if config.material_is_given:
+            material = GivenMaterial(count, **given)
+        else:
+            material = MaterialField(np.zeros((count, 3)), **given)
+            material.parameters = {name: mi.Float(surface.model[name]) for name in material.parameters}
+        light, detail = start_light(fit.scene, surface, config), None
+        if "detail_places" in surface.model:
+            to_lattice = mi.Transform4f(subject.to_world).inverse()
+            side = config.model.color_voxels * max(surface.lattice.resolution, fit.lattices.last.resolution)
+            vertices = to_lattice @ mi.Point3f(subject.surface.vertices)
+            detail = ColorDetail(vertices.numpy().T, side, to_lattice)
+            detail.restore(surface.model)
+        return cls(material, light, detail, optimised_scene(fit.scene, light))
+
+    def findings(self, fit: Fit, warn: Callable[[str], None]) -> dict:
+        """Entries of ``metrics.json``: ``diagnostics`` and, with depth maps, ``depth_error``.
+
+        Args:
+            fit: the views.
+            warn: called with every warning.
+        """
+        subject = fit.scene.subject
+        arrays = [mesh.to_numpy()[:2] for mesh in (subject.surface, subject.template())]
+        found = diagnose(*arrays, fit.views, subject.cell_size)
+        for warning in found.warnings():
+            warn(warning)
+        metrics = {"diagnostics": dataclasses.asdict(found)}
+        error = depth_error(fit.scene, fit.views, self.scene)
+        return metrics if error is None else metrics | {"depth_error": error}

@@ -1,0 +1,47 @@
+"""The fit from top to bottom: its stages, each of which starts where the one before has ended."""
+
+from __future__ import annotations
+
+from ..parametrisation import parametrisation_named
+from ..scene import FitScene
+from .config import FitConfig
+from .lattices import Lattices
+from .stage import Stage
+from .stages.cavities import Cavities
+from .stages.hull import Given, Hull
+from .stages.joint import Joint
+from .stages.openings import Openings
+from .stages.refinement import Refinement
+from .stages.revoxelise import Revoxelise
+from .stages.volume import Volume
+
+
+def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Stage]:
+    """The stages of a fit.
+
+    Args:
+        scene: may give the fields to start from.
+        lattices: that the stages work on.
+        config: the settings.
+    """
+    given = bool(scene.subject.filename)
+    start: list[Stage] = [Given() if given else Hull(config.hull)]  # masks, or a file
+    if not given or Given.is_closed(scene, lattices, config):
+        start += [
+            Openings(config.openings),                              # where the hull is open
+            Cavities(config.cavities),                              # what the hull bridges
+            Refinement("refinement", config.refinement, first=True),    # moves whole parts ...
+            Refinement("folds", config.folds, first=False),         # ... then details
+            Revoxelise(),                                           # fields of what has moved
+        ]
+    if config.volume.iterations and not given:
+        start.append(Volume(config.volume))                         # another start, if it is better
+    # Networks are not tied to a lattice: theirs is the last one from the start.
+    explicit = parametrisation_named(config.model.field).is_explicit
+    if not (config.iterations and config.detail.iterations and explicit):
+        return [*start, Joint("joint", config.joint, config.iterations, lattices.last)]
+    return [
+        *start,
+        Joint("joint", config.joint, config.iterations, lattices.late),     # shape, material and light
+        Joint("detail", config.detail, config.detail.iterations, lattices.last, refines=True),
+    ]

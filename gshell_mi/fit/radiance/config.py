@@ -1,0 +1,33 @@
+"""Settings of the radiance volume."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from ..bounds import Between
+
+
+@dataclass(frozen=True)
+class VolumeConfig:
+    """Radiance volume: another start, for what no hull shows."""
+
+    iterations: int = 700
+    """Steps of the radiance volume whose surface the joint stage starts from if it explains unseen views
+    better; 0 leaves it out."""
+    side: int = 256
+    """Voxels per side of its last level."""
+    resolution: Annotated[int, Between(4)] = 128
+    """Cells per side of the lattice, at least, if the fit starts from it and --resolution does not say."""
+    batch: Annotated[int, Between(1)] = 131072
+    """Rays per step over all pixels, of which those far from the masks are left out."""
+    density_lr: float = 0.3
+    """Adam's step for the logits of the densities; falls tenfold over the last level."""
+    radiance_lr: float = 0.03
+    """Adam's step for the radiance, as a fraction of the targets' mean."""
+    direction_lr: float = 0.03
+    """The same for what depends on the direction."""
+    mask: float = 1.0
+    """Weight of the coverage's squared error beside that of the radiance."""
+    distortion: float = 0.01
+    """Weight of how far apart along a ray is what it sees, in lengths of the lattice's cube."""

@@ -1,0 +1,178 @@
+"""Openings: where the closed hull is open in truth, found by a radiance with opacity on its two sides.
+
+Where it opens the wrong place it sees through it, and learns nothing of what is beside and behind. With a
+trouser leg open at its back, the cap at its end explains the few views that see in as well as the dark
+inside, which is not there. So if some of what it opens is not justified, it is trained once more, from where
+it is opaque there and open where that is justified; and as long as that finds further openings, again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ... import losses
+from ...activations import sigmoid, softplus
+from ...errors import UserError
+from ...images import decibels
+from ...means import mean
+from ...schedules import decay_at
+from ..bookkeeping.observer import Preview
+from ..bounds import Between
+from ..ghost.ghost_template import ghost_template
+from ..ghost.justified import close_unjustified, open_unjustified
+from ..ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice
+from ..ghost.pixels import FAINT
+from ..ghost.radiance_ghost import RadianceGhost
+from ..stage import Fit, Steps
+from ..surface import TYPICAL_REFLECTANCE, Seen, Surface
+
+#: Logit, at most, of what has been justified before.
+_OPEN = -1.0
+
+
+@dataclass(frozen=True)
+class OpeningsConfig:
+    """Openings of the hull, by radiance and opacity."""
+
+    iterations: Annotated[int, Between(1)] = 400
+    """Steps that find where the hull is open."""
+    mask: float = 0.003
+    """Weight of the mask loss. The image loss also sees the mask; a large weight closes every cap before
+    the images can open it."""
+    daylight: float = 0.1
+    """Weight of coverage where a mask shows daylight through the template: proof of openings, unlike the rest
+    of the mask."""
+    binary: float = 0.01
+    """Final weight of the loss that makes opacity decide; ramps up over the second half."""
+    closing: float = 0.0005
+    """Final weight of the loss that closes what the images leave undecided."""
+    chroma: float = 0.003
+    """Weight of the tie between the chroma of a sheet's two sides."""
+    gain: float = 0.93
+    """An opening stays if the image error through it is below this fraction of what it is when closed."""
+    rounds: int = 3
+    """How often, at most, the steps are done again for what wrong openings have hidden."""
+
+
+class Openings:
+    """Cuts the surface open where the images justify it, and finds its radiance."""
+
+    name = "openings"
+
+    def __init__(self, config: OpeningsConfig):
+        self.config = config
+
+    def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
+        """The surface with openings, and what was seen of it.
+
+        Raises:
+            UserError: nothing opaque was found.
+        """
+        closed = surface.with_fields(msdf=np.ones_like(surface.fields.sdf))
+        template = ghost_template(fit.scene.subject, closed)
+        vertices, faces, count = template.vertices, template.faces, self.config.iterations
+        ghost = RadianceGhost(template.start, faces, fit.views, fit.pixels, fit.config.radiance,
+                              seed=fit.config.seed)
+        training = OpacityTraining(ghost, self.config)
+        if not fit.config.watertight:
+            steps.run(training, count, {"radiance": ghost.optimizer})
+        with steps.task("verdict"):
+            logits = np.ones(len(vertices))
+            if not fit.config.watertight:
+                logits = find_openings(ghost, vertices, faces, self.config, fit.config.min_area,
+                                       lambda again: steps.repeat(training, count, again * count))
+            opened = logits <= 0
+            ghost.refit(~opened)
+        if opened.all():
+            raise UserError(f"There is nothing opaque in '{fit.scene.path}'; give the fit more steps with "
+                            f"--openings.iterations, or check the cameras.")
+        front, _ = ghost.radiance()
+        msdf = msdf_from_template(logits, template.mesh, surface.lattice)
+        radiance, known = splat_to_lattice(mi.Float(front.ravel()), template.mesh, surface.lattice)
+        light = np.float32(float(np.median(front[~opened].mean(axis=1))) / TYPICAL_REFLECTANCE)
+        seen = Seen(radiance.numpy().reshape(-1, 3), known.numpy(), light)
+        return replace(surface.with_fields(msdf=msdf.numpy()), seen=seen)
+
+
+class OpacityTraining:
+    """Trains opacity and radiance together, on random pixels of all views."""
+
+    def __init__(self, ghost: RadianceGhost, config: OpeningsConfig):
+        self.ghost, self.config = ghost, config
+
+    def step(self, iteration: int) -> dict[str, float]:
+        """One Adam step on a batch of random pixels; returns the losses."""
+        config, ghost = self.config, self.ghost
+        progress = iteration / config.iterations
+        sample, radiance, alpha, _ = ghost.render(iteration)
+        share, weight = ghost.pixels.share, ghost.pixels.mask_weight
+        image = share * losses.l1(ghost.tone(radiance), ghost.tone(sample.radiance))
+        mask = share * losses.mask_l2(alpha, sample.alpha)
+        # Where a mask shows daylight within the hull, every sheet on the ray is open: no doubt, no balance.
+        daylight = share * losses.mask_l2(dr.select(sample.alpha < FAINT, alpha, 0), 0)
+        opacity = sigmoid(ghost.optimizer["opacity"])
+        front, back = (softplus(side) for side in ghost.sides())
+        # Undecided opacity must have its say first; only then is it made to decide.
+        late = dr.opaque(mi.Float, max(0.0, 2 * progress - 1))
+        total = (
+            image
+            + weight(config.mask) * mask
+            + weight(config.daylight) * daylight
+            + late * config.binary * losses.binary_entropy_bound(opacity)
+            + late * config.closing * losses.transparency(opacity)
+            + config.chroma * losses.chroma_difference(front, back)
+        )
+        dr.backward(total)
+        ghost.update(("opacity", "radiance"), ghost.config.lr * decay_at(progress))
+        error = share * mean(dr.square(dr.detach(radiance) - sample.radiance))
+        return {"loss": total[0], "image": image[0], "mask": mask[0],
+                "psnr": decibels(error[0])}
+
+    def preview(self) -> Preview:
+        """What is not clearly fading."""
+        return self.ghost.preview()
+
+
+def find_openings(ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray, config: OpeningsConfig,
+                  min_area: float, train: Callable[[int], None]) -> np.ndarray:
+    """Where the images justify an opening.
+
+    Args:
+        ghost: after its training; it is trained further.
+        vertices, faces: (V, 3) and (F, 3) of its template.
+        config: ``gain`` and ``rounds``.
+        min_area: cuts and islands that are undone, as of ``clean_opacity``.
+        train: does all steps of its training; told for which time, after the first, from 1.
+
+    Returns:
+        (V,) opacity logits, negative at openings.
+    """
+    gain, clean = config.gain, partial(clean_opacity, vertices=vertices, faces=faces, min_area=min_area)
+    # At a gain of 0 nothing will be justified.
+    rounds = config.rounds if gain > 0 else 0
+    opened, unjustified = (np.zeros(len(vertices), bool) for _ in range(2))
+    for trained_again in range(rounds + 1):
+        if trained_again:
+            ghost.begin_again(unjustified, opened)
+            train(trained_again)
+        proposed = clean(ghost.smoothed_logits())
+        proposed = np.where(opened, np.minimum(proposed, _OPEN), proposed)
+        logits = proposed
+        for judge in (close_unjustified, open_unjustified):
+            logits = clean(judge(logits, faces, ghost.image_error, gain))
+        # A close call may come out otherwise now.
+        logits = np.where(opened, np.minimum(logits, _OPEN), logits)
+        unjustified |= (proposed <= 0) & (logits > 0)
+        # Rims differ a little each time.
+        further = clean(np.where((logits <= 0) & ~opened, -1.0, 1.0)) <= 0
+        opened = logits <= 0
+        if not unjustified.any() or (trained_again and not further.any()):
+            break
+    return logits

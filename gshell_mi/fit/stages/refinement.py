@@ -1,0 +1,124 @@
+"""Refinement and folds: the template's vertices move to where one radiance explains all images.
+
+The first round moves whole parts calmly; the second, "folds", hollows out pleats. Each is judged by views
+that it does not see: it does not count unless one radiance explains them the better for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import mitsuba as mi
+import numpy as np
+
+from ..ghost.ghost_template import GhostTemplate, ghost_template
+from ..ghost.radiance_ghost import RadianceGhost
+from ..refinement.descent import Descent
+from ..refinement.outlines import Outlines
+from ..refinement.refinement import PhotometricRefinement
+from ..stage import Fit, Steps
+from ..surface import Moved, Surface
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """Photometric refinement: whole parts."""
+
+    iterations: int = 400
+    """Steps; 0 keeps the shape as it is."""
+    lr: float = 0.12
+    """Largest movement of a vertex per step, in cells; falls to 0 like a cosine."""
+    smoothing: float = 95.0
+    """Lambda of the Sobolev gradient on the template when it starts to move, in square cells: whole parts
+    move first."""
+    detail: float = 34.0
+    """Lambda at the end; falls geometrically. Nothing is smoothed if either is 0."""
+    radiance_lr: float = 0.05
+    """Adam's step for the radiance meanwhile."""
+    outline: float = 0.001
+    """Weight of the squared distance, in cells, between silhouettes and masks; falls to half."""
+    gain: float = 0.9
+    """It is kept if it brings the image error of views that it did not see below this fraction. Where
+    radiance depends much on the view (gloss), it may explain the views it sees by a wrong shape."""
+    descent: float | None = None
+    """It ends after a quarter of its steps unless the image error is below this fraction of what it was at
+    first; default: it goes on."""
+
+
+@dataclass(frozen=True)
+class FoldsConfig(RefinementConfig):
+    """Photometric refinement once more: details, which move farther."""
+
+    iterations: int = 440
+    lr: float = 0.3
+    smoothing: float = 34.0
+    detail: float = 11.0
+    gain: float = 0.97
+    descent: float | None = 0.98
+
+
+class Refinement:
+    """Moves the template's vertices once; the fields stay until ``Revoxelise``.
+
+    Args:
+        name: of the round.
+        config: its settings.
+        first: whether it starts from the template. If not, it starts from what the round before has made of
+            it, and does nothing if that has not counted.
+    """
+
+    def __init__(self, name: str, config: RefinementConfig, *, first: bool):
+        self.name, self.config, self.first = name, config, first
+
+    def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
+        """The surface with one more entry in ``moved`` if that counts: before the others if it is better."""
+        surface = surface.on_grid(fit.lattices.late.grid)
+        if not self.config.iterations or not (self.first or surface.moved):
+            return surface
+        steps.fact(f"{self.name}_kept", False)
+        template = ghost_template(fit.scene.subject, surface)
+        ghost = RadianceGhost(template.start, template.faces, fit.views, fit.training, fit.config.radiance,
+                              seed=fit.config.seed, glossy=True)
+        before = self._standing(ghost, template, fit) if self.first else surface.moved[0]
+        if not self.first:
+            ghost.take_over(before.positions, before.fitted, template.solid)
+        after = self._moved(ghost, template, before.positions, fit, steps, fit.cell(surface))
+        better = after is not None and after.error < self.config.gain * before.error
+        if self.first:
+            return replace(surface, moved=(after,)) if better else surface
+        if after is None:
+            return surface
+        return replace(surface, moved=(after, before) if better else (before, after))
+
+    def _standing(self, ghost: RadianceGhost, template: GhostTemplate, fit: Fit) -> Moved:
+        """The template at rest, with a radiance fitted anew."""
+        ghost.move(mi.Float(template.start.ravel()))
+        ghost.refit_anew(template.solid)
+        return self._seen(ghost, template.start, fit)
+
+    def _moved(self, ghost: RadianceGhost, template: GhostTemplate, positions: np.ndarray, fit: Fit,
+               steps: Steps, cell: float) -> Moved | None:
+        """The template after the steps; None if they get nowhere."""
+        outlines = None
+        if fit.training.has_alpha:
+            outlines = Outlines(fit.views, fit.alphas, template.faces, template.solid)
+        refinement = PhotometricRefinement(ghost, positions, template.faces, outlines, cell, self.config,
+                                           fit.config.seed)
+        run = partial(steps.run, count=self.config.iterations,
+                      optimizers={"radiance": ghost.optimizer, "refinement": refinement.optimizer})
+        if self.config.descent is None:
+            run(refinement)
+        else:
+            watched = Descent(refinement, self.config.iterations, self.config.descent, steps.kept)
+            run(watched, state=watched.state, stalled=watched.stalled)
+            if watched.stalled(self.config.iterations):
+                return None
+        with steps.task("verdict"):
+            ghost.move(mi.Float(refinement.positions().ravel()))
+            ghost.refit(template.solid)
+            return self._seen(ghost, refinement.positions(), fit)
+
+    def _seen(self, ghost: RadianceGhost, positions: np.ndarray, fit: Fit) -> Moved:
+        radiance, _ = ghost.radiance()
+        return Moved(self.name, positions, radiance, ghost.unexplained(fit.held_out), ghost.fitted())

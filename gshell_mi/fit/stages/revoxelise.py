@@ -1,0 +1,95 @@
+"""Revoxelise: fields are made anew from a template whose vertices have moved, and what nobody sees goes.
+
+Sides of thin sheets that a template can do without are left out on the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+
+from ...fields import LatticeFields
+from ...lattice import Lattice
+from ...topology import topology
+from ...triangles import positive_part
+from ..cut.recast import recast
+from ..cut.spare_sides import Cut, without_spare_sides
+from ..cut.unseen import without_unseen
+from ..ghost.ghost_template import GhostTemplate, ghost_template
+from ..ghost.opening import clean_opacity
+from ..stage import Fit, Steps
+from ..surface import Moved, Seen, Surface
+
+
+class Revoxelise:
+    """Takes the best of what stages have moved the template to that comes out whole."""
+
+    name = "revoxelise"
+
+    def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
+        """The surface where it has been moved to; without any movement, what was grown for being thin shrinks
+        back."""
+        surface = surface.on_grid(fit.lattices.late.grid)
+        with steps.task():
+            template = ghost_template(fit.scene.subject, surface)
+            radiance = template.mesh.interpolate(mi.Float(surface.seen.radiance.ravel()), 3).numpy().T
+            still = Moved("start", template.start, radiance, np.inf)
+            found, taken = best_revoxelised(fit, template, (*surface.moved, still), surface.lattice,
+                                            surface.seen.light)
+            steps.fact("refinement_kept", taken not in ("start", ""))
+            if taken == "folds":
+                steps.fact("folds_kept", True)
+            return without_unseen_parts(fit, found or replace(surface, hull=None, moved=()))
+
+
+def best_revoxelised(fit: Fit, template: GhostTemplate, moved: Iterable[Moved], lattice: Lattice,
+                     light: np.float32) -> tuple[Surface | None, str]:
+    """The first movement of a template of which fields can be made, cut as well as can be.
+
+    Args:
+        fit: whose settings count.
+        template: before it moved.
+        moved: the best first.
+        lattice: of the fields.
+        light: of what was seen.
+
+    Returns:
+        The surface and the stage that has moved it; None and an empty name if none comes out whole.
+    """
+    subject, min_area = fit.scene.subject, fit.config.min_area
+    for candidate in moved:
+        if (candidate.positions == template.vertices).all():
+            continue
+        for cut in _cuts(fit, template, candidate.positions, lattice.spacing * subject.length_scale):
+            fields = recast(subject, lattice, template.vertices, cut.positions, template.faces, cut.logits,
+                            candidate.radiance, min_area, cut.topology, cut.fewest_loops)
+            if fields:
+                closed = LatticeFields.closed(fields["sdf"], lattice.grid)
+                seen = Seen(fields["radiance"], fields["known"], light)
+                return Surface(replace(closed, msdf=fields["msdf"]), seen=seen), candidate.stage
+    return None, ""
+
+
+def without_unseen_parts(fit: Fit, surface: Surface) -> Surface:
+    """The surface without what no view sees from either side, if there is much of that."""
+    if fit.config.watertight or fit.config.unseen_area >= 1:
+        return surface
+    msdf = without_unseen(fit.scene.subject, surface.fields, fit.views, fit.config.unseen_area)
+    return surface if msdf is None else surface.with_fields(msdf=msdf.numpy())
+
+
+def _cuts(fit: Fit, template: GhostTemplate, moved: np.ndarray, cell: float) -> list[Cut]:
+    """How to cut a moved template, the best first."""
+    config = fit.config
+    # What has become too small by moving is noise, and no reason to leave all where it was.
+    logits = clean_opacity(template.logits, moved, template.faces, config.min_area)
+    found = topology(*positive_part(template.vertices, template.faces, logits))
+    as_found = Cut(logits, moved, found, found.boundary_loops)
+    if config.watertight or not config.sheet_thickness:
+        return [as_found]
+    cut = without_spare_sides(as_found, template.vertices, template.faces, cell, config.sheet_thickness,
+                              config.min_area)
+    return [cut, as_found] if cut else [as_found]

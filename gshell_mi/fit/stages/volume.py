@@ -1,0 +1,72 @@
+"""Volume: another start than the hull, from a radiance volume; unseen views judge between the two."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import mitsuba as mi
+import numpy as np
+import trimesh
+
+from ...fields.visual_hull import visual_hull
+from ..judge import judge
+from ..radiance.config import VolumeConfig
+from ..radiance.volume import RadianceVolume
+from ..radiance.volume_surface import volume_surface
+from ..stage import Fit, Steps
+from ..surface import Moved, Surface
+from .revoxelise import best_revoxelised, without_unseen_parts
+
+
+class Volume:
+    """Takes the surface of a radiance volume if that explains unseen views better."""
+
+    name = "volume"
+
+    def __init__(self, config: VolumeConfig):
+        self.config = config
+
+    def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
+        """The better one of both surfaces; that of the volume is on a lattice of its own."""
+        subject, lattice = fit.scene.subject, fit.lattices.volume
+        before = subject.surface_of(surface.fields).to_numpy()[:2]
+        volume = self._volume(fit, before, steps.kept)
+        steps.run(volume, self.config.iterations, volume.optimizers, volume.arrays)
+        with steps.task("depth", len(fit.views)) as advance:
+            found = volume_surface(volume, fit.scene, lattice, advance)
+            if found is None:
+                return surface
+            moved = Moved(self.name, found.positions, found.radiance, np.inf)
+            other, _ = best_revoxelised(fit, found.template, (moved,), lattice, surface.seen.light)
+        if other is None:
+            return surface
+        with steps.task("verdict"):
+            # Its radiance may be as fine as that of the other.
+            after = subject.surface_of(other.fields).to_numpy()[:2]
+            before = _as_fine(before, fit.cell(other))
+            verdict = judge(before, after, fit.views, fit.scene.targets, fit.config)
+        steps.fact("volume", dataclasses.asdict(verdict))
+        steps.fact("volume_kept", verdict.accepted)
+        return without_unseen_parts(fit, other) if verdict.accepted else surface
+
+    def _volume(self, fit: Fit, surface: tuple[np.ndarray, np.ndarray],
+                kept: Mapping[str, np.ndarray]) -> RadianceVolume:
+        """A radiance volume inside the visual hull, or the one that was begun."""
+        side, subject = RadianceVolume.first_side(self.config), fit.scene.subject
+        centre = (np.arange(side, dtype=np.float32) + 0.5) * (2 / side) - 1
+        z, y, x = (axis.ravel() for axis in np.meshgrid(centre, centre, centre, indexing="ij"))
+        points = mi.Transform4f(subject.to_world) @ mi.Point3f(x, y, z)
+        hull = visual_hull(points, fit.views, fit.alphas)
+        hull = np.clip(hull.numpy() / subject.length_scale, -1, 1).reshape((side,) * 3)
+        return RadianceVolume(hull, subject.to_world, fit.views, fit.pixels, self.config, surface, kept,
+                              seed=fit.config.seed)
+
+
+def _as_fine(surface: tuple[np.ndarray, np.ndarray], length: float) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh whose edges are at most about as long as given."""
+    vertices, faces = surface
+    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+    if len(faces) and np.median(np.linalg.norm(edges, axis=-1)) > 1.5 * length:
+        return trimesh.remesh.subdivide(vertices, faces)
+    return surface

@@ -1,0 +1,126 @@
+"""What one stage hands to the next: a surface on a lattice, and what was seen there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..fields import LatticeFields
+from ..lattice import GRIDS, Lattice
+
+#: Median reflectance that the first split of radiance into material and light assumes.
+TYPICAL_REFLECTANCE = 0.5
+
+#: Lattice fields that are always there, and those that some surfaces have.
+_FIELDS, _OPTIONAL = ("sdf", "msdf", "deform"), ("weights", "blocks")
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What images show of a surface as long as there is neither light nor material.
+
+    Attributes:
+        radiance: (n, 3) at the lattice's vertices.
+        known: (n,) which of these have one.
+        light: brightness of an even light that explains it.
+    """
+
+    radiance: np.ndarray
+    known: np.ndarray
+    light: np.float32
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Where a stage has moved the vertices of the surface's template.
+
+    Attributes:
+        stage: its name.
+        positions: (V, 3) world positions.
+        radiance: (V, 3) of the outer side.
+        error: mean image loss of the views that it did not see.
+        fitted: the radiance's optimiser, for a stage that goes on from there.
+    """
+
+    stage: str
+    positions: np.ndarray
+    radiance: np.ndarray
+    error: float
+    fitted: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface, immutable.
+
+    Attributes:
+        fields: its fields on a lattice.
+        hull: (n,) the signed distance before thin parts were grown; None where none were.
+        seen: what was seen there; None before anything was looked at.
+        moved: where stages have moved its template, the best first.
+        model: material, light and colour detail that a joint stage has left, flat arrays by name.
+        revision: what a topology revision has changed, for the stages after it; flat arrays by name.
+    """
+
+    fields: LatticeFields
+    hull: np.ndarray | None = None
+    seen: Seen | None = None
+    moved: tuple[Moved, ...] = ()
+    model: Mapping[str, np.ndarray] = field(default_factory=dict)
+    revision: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def lattice(self) -> Lattice:
+        """What the fields live on."""
+        return self.fields.lattice
+
+    def on_grid(self, grid: str) -> Surface:
+        """The same values at the same vertices, drawn with another kind of cells."""
+        return replace(self, fields=replace(self.fields, grid=grid))
+
+    def with_fields(self, **fields: np.ndarray) -> Surface:
+        """The surface with some of its lattice fields replaced."""
+        return replace(self, fields=replace(self.fields, **fields))
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """The surface as flat arrays, for ``from_arrays``."""
+        arrays = {"grid": np.array(GRIDS.index(self.fields.grid)),
+                  "block_resolution": np.array(self.fields.block_resolution)}
+        optional = {name: getattr(self.fields, name) for name in (*_FIELDS, *_OPTIONAL)} | {"hull": self.hull}
+        arrays |= {name: array for name, array in optional.items() if array is not None}
+        if self.seen:
+            arrays |= {name: getattr(self.seen, name) for name in ("radiance", "known", "light")}
+        for index, moved in enumerate(self.moved):
+            arrays |= {f"moved {index} {moved.stage} {name}": np.asarray(getattr(moved, name))
+                       for name in ("positions", "radiance", "error")}
+            arrays |= {f"moved {index} {moved.stage} fitted {name}": array
+                       for name, array in moved.fitted.items()}
+        for part in ("model", "revision"):
+            arrays |= {f"{part} {name}": array for name, array in getattr(self, part).items()}
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Surface:
+        """What ``to_arrays`` gave."""
+        fields = LatticeFields(**{name: arrays[name] for name in _FIELDS}, grid=GRIDS[int(arrays["grid"])],
+                               **{name: arrays[name] for name in _OPTIONAL if name in arrays},
+                               block_resolution=int(arrays["block_resolution"]))
+        seen = None
+        if "radiance" in arrays:
+            seen = Seen(arrays["radiance"], arrays["known"], np.float32(arrays["light"]))
+        stages = sorted({tuple(name.split(" ")[1:3]) for name in arrays if name.startswith("moved ")})
+        moved = [_moved(stage, _under(arrays, f"moved {index} {stage} ")) for index, stage in stages]
+        return cls(fields, arrays.get("hull"), seen, tuple(moved), _under(arrays, "model "),
+                   _under(arrays, "revision "))
+
+
+def _moved(stage: str, arrays: Mapping[str, np.ndarray]) -> Moved:
+    return Moved(stage, arrays["positions"], arrays["radiance"], float(arrays["error"]),
+                 _under(arrays, "fitted "))
+
+
+def _under(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays whose names have a prefix, without it."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
