@@ -10,7 +10,9 @@ The rooms, in the order in which data flows through them:
 - ``capture``: photographs with known cameras become a fit scene, ``python -m gshell_mi.capture``
 - ``targets``, ``views``, ``scene``: what a fit starts from
 - ``parametrisation``: what an optimiser changes in place of the lattice fields
+- ``template``: what can be done to a watertight surface and the mSDF that cuts it
 - ``activations``, ``losses``, ``material``, ``light``, ``fit``: the optimisation, ``python -m gshell_mi.fit``
+- ``extras``: losses and parametrisations that it knows by name and leaves out by default
 - ``viewer``: a look at it while it runs, ``--viewer``
 - ``images``, ``topology``, ``export``, ``turntable``, ``report``: what it leaves behind
 - ``evaluation``, ``compare``: how good it is

@@ -11,8 +11,8 @@ import trimesh
 from gshell_mi.compat import mesh_scene
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit.config import FitConfig
-from gshell_mi.fit.ghost.pixels import PixelPool
-from gshell_mi.fit.ghost.radiance_ghost import RadianceConfig
+from gshell_mi.fit.radiance.pixels import PixelPool
+from gshell_mi.fit.radiance.surface_radiance import RadianceConfig
 from gshell_mi.fit.stages.cavities import CavitiesConfig
 from gshell_mi.fit.surface import Seen, Surface
 from gshell_mi.targets import Target

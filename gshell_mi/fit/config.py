@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from .bounds import Between, check_bounds, leaves
-from .ghost.radiance_ghost import RadianceConfig
 from .joint.config import LossConfig, ModelConfig, RenderConfig
 from .radiance.config import VolumeConfig
+from .radiance.surface_radiance import RadianceConfig
 from .stages.cavities import CavitiesConfig
 from .stages.hull import HullConfig
 from .stages.joint import DetailConfig, JointConfig

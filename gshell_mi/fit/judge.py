@@ -14,7 +14,7 @@ from ..compat import mesh_scene
 from ..fields.smoothing import MeshDiffusion
 from ..targets import Target
 from ..views import PinholeViews
-from .ghost.pixels import COVERED, PixelPool
+from .radiance.pixels import COVERED, PixelPool
 
 if TYPE_CHECKING:
     from .config import FitConfig

@@ -14,8 +14,8 @@ import numpy as np
 from ..scene import FitScene
 from ..views import PinholeViews
 from .bookkeeping.observer import Preview
-from .ghost.pixels import PixelPool
 from .lattices import Lattices
+from .radiance.pixels import PixelPool
 from .surface import Surface
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 ``docs/losses.md`` has their formulas and when to raise which weight.
 
 - ``image``: what a render and a target differ by
-- ``opacity``: what the radiance ghost should decide
+- ``opacity``: what the opacity of the openings stage should decide
 - ``mesh``: smoothness along a mesh, of values and of the surface itself
 - ``sdf``, ``msdf``: regularisers of the fields on the lattice
 - ``light``: priors of an environment map

@@ -1,4 +1,4 @@
-"""What a radiance ghost's opacity should decide."""
+"""What the opacity of the openings stage should decide."""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ from bowl import RADIUS, half_sphere
 from scipy.spatial import Delaunay
 
 from gshell_mi.fit import FitConfig
-from gshell_mi.fit.ghost.radiance_ghost import RadianceConfig
 from gshell_mi.fit.judge import Verdict, judge
+from gshell_mi.fit.radiance.surface_radiance import RadianceConfig
 from gshell_mi.scene import load_fit_scene
 from gshell_mi.views import PinholeViews
 

@@ -72,8 +72,8 @@ def test_a_value_equal_to_the_usual_default_counts_too(given):
     assert given("--effort", "preview", "--render.primal-spp", str(usual)).config.render.primal_spp == usual
 
 
-def test_without_refinement_there_is_no_ghost_for_it(bowl_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("gshell_mi.fit.stages.refinement.RadianceGhost", None)
+def test_without_refinement_there_is_no_radiance_for_it(bowl_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("gshell_mi.fit.stages.refinement.SurfaceRadiance", None)
     short = [*SHORT, *CLOSED, "--iterations", "1", "--refinement.iterations", "0"]
     assert main([str(bowl_scene), "-o", str(tmp_path), *short]) == 0
     metrics = json.loads((tmp_path / "metrics.json").read_text())

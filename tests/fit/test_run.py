@@ -104,7 +104,7 @@ def test_log_has_a_line_per_step(whole):
     counts = {"openings": 100, "cavities": 10, "refinement": 8, "joint": 12}
     assert steps(whole) == [(stage, i) for stage, count in counts.items() for i in range(count)]
     losses = [json.loads(line)["image"] for line in (whole / "log.jsonl").read_text().splitlines()]
-    assert np.mean(losses[90:100]) < 0.8 * np.mean(losses[:10]), "the ghost learns"
+    assert np.mean(losses[90:100]) < 0.8 * np.mean(losses[:10]), "the openings stage learns"
 
 
 def test_exported_scene_renders_without_the_package(whole):

@@ -127,8 +127,8 @@ def test_a_fit_that_is_done_does_nothing(tmp_path):
 
 def test_a_checkpoint_in_a_stage_that_there_is_not(tmp_path):
     run(tmp_path, [Rises("first")])
-    checkpoint = replace(Checkpoint.load(checkpoint_path(tmp_path)), stage="ghost")
-    with pytest.raises(UserError, match="is in the stage 'ghost', which this fit has not"):
+    checkpoint = replace(Checkpoint.load(checkpoint_path(tmp_path)), stage="appearance")
+    with pytest.raises(UserError, match="is in the stage 'appearance', which this fit has not"):
         run(tmp_path, [Rises("first")], checkpoint)
 
 

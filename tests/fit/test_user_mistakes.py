@@ -293,7 +293,7 @@ def test_given_fields_without_a_surface(told, scene):
 
 
 def test_nothing_opaque(told, monkeypatch):
-    monkeypatch.setattr("gshell_mi.fit.stages.openings.close_unjustified", lambda logits, *_: -abs(logits))
+    monkeypatch.setattr("gshell_mi.fit.stages.openings.close_rejected", lambda logits, *_: -abs(logits))
     assert "nothing opaque" in told(whole=True)
 
 

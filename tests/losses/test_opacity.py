@@ -1,4 +1,4 @@
-"""Losses of the ghost's opacity."""
+"""Losses of the opacity in the openings stage."""
 
 import mitsuba as mi
 import numpy as np

@@ -166,12 +166,12 @@ def test_an_interrupted_fit_goes_on(scene, tmp_path, monkeypatch):
 
 def test_a_fit_that_fails_is_told(scene, tmp_path, monkeypatch, capsys):
     def failing(*args, **options):
-        raise UserError("The ghost found nothing opaque.")
+        raise UserError("There is nothing opaque.")
 
     monkeypatch.setattr(trials, "fit_scene", failing)
     ((_, found),) = run_trials([Trial(scene, "default", FitConfig())], tmp_path)
-    assert found.error == "The ghost found nothing opaque."
-    assert "default: failed: The ghost found nothing opaque." in capsys.readouterr().out
+    assert found.error == "There is nothing opaque."
+    assert "default: failed: There is nothing opaque." in capsys.readouterr().out
 
 
 def test_scene_without_truth(tmp_path, capsys):

@@ -58,7 +58,7 @@ def test_page_is_self_contained(folder):
     assert "1 floater &lt;here&gt;" in page, "warnings are told"
     assert "<td>diagnostics.floaters</td><td>1</td>" in page and "<td>peak_memory_mib</td>" in page
     assert "31.25 dB" in page and "view_000: target | fit, 31.50 dB" in page and "view_002" in page
-    assert "ghost_iterations" in text and "seconds.hull" in text
+    assert "daylight_votes" in text and "seconds.hull" in text
 
 
 METRICS = {"scene": "a.xml", "psnr_training": 30.0, "psnr_per_view": {"view_000": 30.0}, "versions": {},

@@ -76,7 +76,7 @@ def test_a_client_receives_cameras_meshes_and_losses(viewer, bowl_scene):
 def test_it_takes_little_of_the_time(viewer):
     look, count = _Counted(), 500
     for iteration in range(count):
-        viewer.step("ghost", iteration, count, {"loss": 1.0, "psnr": 10.0}, look)
+        viewer.step("appearance", iteration, count, {"loss": 1.0, "psnr": 10.0}, look)
     assert look.asked == 2, "the first step and the last, as all took less than an interval"
     viewer.step("joint", 0, count, {"loss": 1.0, "psnr": 10.0}, look)
     assert look.asked == 3, "a new stage shows at once"
@@ -120,7 +120,7 @@ def test_of_a_whole_fit(bowl_scene, tmp_path, capfd, monkeypatch):
     options = [*SHORT, *CLOSED, "--iterations", "2", "--quiet", "--viewer", "--viewer-port", "0"]
     assert main([str(bowl_scene), "-o", str(tmp_path / "out"), *options]) == 0
     assert "live view: http://localhost:" in capfd.readouterr().err
-    assert set(seen) == {"ghost", "carving", "refinement", "joint"}
+    assert set(seen) == {"appearance", "carving", "refinement", "joint"}
     for found in seen.values():
         assert found.faces.max() < len(found.vertices) == len(found.colors)
         assert np.linalg.norm(found.vertices, axis=1).max() < 1 and len(found.faces) > 100

@@ -18,7 +18,7 @@ class Preview:
     Attributes:
         vertices: (V, 3) world positions.
         faces: (F, 3) of the open mesh.
-        colors: (V, 3) linear Rec.709: radiance of the front in the ghost, base colour in the joint stage.
+        colors: (V, 3) linear Rec.709: radiance of the front before the joint stage, base colour in it.
         template_vertices, template_faces: the watertight template.
     """
 

@@ -10,15 +10,15 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
+from ...template.msdf import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
 from ...topology import topology
 from ...triangles import positive_part
-from ..ghost.ghost_template import GhostTemplate, ghost_template
-from ..ghost.justified import close_unjustified
-from ..ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
-from ..ghost.radiance_ghost import RadianceGhost
+from ..radiance.acceptance import close_rejected
+from ..radiance.surface_radiance import SurfaceRadiance
 from ..stage import Fit
 from ..surface import Seen, Surface
-from .fitted_ghost import fitted_ghost, ray_errors
+from ..template import Template, template_of
+from .fitted_radiance import fitted_radiance, ray_errors
 from .hollows import SEEN, hollowed, hollows
 from .radiance_volume import RadianceVolume
 
@@ -60,12 +60,12 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
     carved = hollowed(surface, distance)
     if not (carved.fields.sdf < 0).any():
         return None
-    before = ghost_template(subject, surface)
-    after = ghost_template(subject, carved, like=before)
+    before = template_of(subject, surface)
+    after = template_of(subject, carved, like=before)
     label, count = ndimage.label(distance > 0, np.ones((3, 3, 3)))
     label = np.where(label, label, ndimage.maximum_filter(label, size=3))
-    ghosts = [fitted_ghost(template, fit) for template in (before, after)]
-    errors = _errors_in_hollows(*ghosts, label, count, volume, fit, lattice.spacing)
+    appearances = [fitted_radiance(template, fit) for template in (before, after)]
+    errors = _errors_in_hollows(*appearances, label, count, volume, fit, lattice.spacing)
     kept = errors[1] < _GAIN * errors[0]
     if not kept[1:].any():
         return None
@@ -74,8 +74,8 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
         owner = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
         distance = np.where(kept[label[tuple(owner)]], distance, -np.inf)
         carved = hollowed(surface, distance)
-        after = ghost_template(subject, carved, like=before)
-        ghosts[1] = fitted_ghost(after, fit)
+        after = template_of(subject, carved, like=before)
+        appearances[1] = fitted_radiance(after, fit)
     clean = partial(clean_opacity, vertices=after.vertices, faces=after.faces, min_area=min_area)
     cleaned = clean(after.logits)
     was, became = (topology(*positive_part(template.vertices, template.faces, logits))
@@ -85,19 +85,19 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
     if not fit.config.watertight:
         # Now that what lies behind is in its place, the images may justify more openings.
         proposed = clean(np.where(_in_empty_space(after, volume, opacity, seen), -_CERTAIN, cleaned))
-        ghost = RadianceGhost(after.start, after.faces, fit.views, fit.training, fit.config.radiance,
-                              seed=fit.config.seed)
-        ghost.refit_anew(proposed > 0)
-        justified = close_unjustified(proposed, after.faces, ghost.image_error, volume.config.opening_gain)
+        appearance = SurfaceRadiance(after.start, after.faces, fit.views, fit.training, fit.config.radiance,
+                                     seed=fit.config.seed)
+        appearance.refit_anew(proposed > 0)
+        justified = close_rejected(proposed, after.faces, appearance.image_error, volume.config.opening_gain)
         # Those that there were have been judged, and a close call may come out otherwise now.
         cleaned = clean(np.where(cleaned > 0, justified, proposed))
-    radiance, found = splat_to_lattice(mi.Float(ghosts[1].radiance()[0].ravel()), after.mesh, lattice)
+    radiance, found = splat_to_lattice(mi.Float(appearances[1].radiance()[0].ravel()), after.mesh, lattice)
     msdf = without_specks(msdf_from_template(cleaned, after.mesh, lattice), after.mesh, lattice, min_area)
     seen = Seen(radiance.numpy().reshape(-1, 3), found.numpy(), surface.seen.light)
     return replace(carved.with_fields(msdf=msdf.numpy()), seen=seen)
 
 
-def _in_empty_space(template: GhostTemplate, volume: RadianceVolume, opacity: np.ndarray,
+def _in_empty_space(template: Template, volume: RadianceVolume, opacity: np.ndarray,
                     seen: np.ndarray) -> np.ndarray:
     """(V,) whether there is nothing within a cell of a vertex, and it is seen."""
     local = volume.to_lattice @ mi.Point3f(np.ascontiguousarray(template.vertices.T, np.float32))
@@ -107,9 +107,9 @@ def _in_empty_space(template: GhostTemplate, volume: RadianceVolume, opacity: np
             & (ndimage.map_coordinates(seen, index, order=1) > SEEN))
 
 
-def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.ndarray, count: int,
+def _errors_in_hollows(before: SurfaceRadiance, after: SurfaceRadiance, label: np.ndarray, count: int,
                        volume: RadianceVolume, fit: Fit, spacing: float) -> np.ndarray:
-    """(2, count + 1) sums of both ghosts' errors over rays that see into each hollow, or through it.
+    """(2, count + 1) sums of both templates' errors over rays that see into each hollow, or through it.
 
     Rays that find nothing any more count by where they enter, and by their coverage: a hollow must leave the
     masks as they are. One that no ray sees into has no errors, hence no gain.
@@ -121,8 +121,8 @@ def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.nd
         for step in range(_ERROR_STEPS):
             sample = fit.held_out.sample(config.radiance.batch, seed=config.seed, step=step)
             ray = fit.views.rays(sample.view, sample.film)
-            near, far = (ghost.scene.ray_intersect_preliminary(ray, coherent=False)
-                         for ghost in (before, after))
+            near, far = (appearance.scene.ray_intersect_preliminary(ray, coherent=False)
+                         for appearance in (before, after))
             # On a GPU, a kernel traces rays in one scene only.
             dr.eval(near)
             dr.eval(far)
@@ -132,8 +132,8 @@ def _errors_in_hollows(before: RadianceGhost, after: RadianceGhost, label: np.nd
             deeper = through | far.is_valid() & (dr.norm(end - start) > _DEEPER * spacing)
             x, y, z = mi.Vector3u(dr.clip(dr.round((end + 1) / spacing), 0, mi.Float(side - 1)))
             hollow = dr.gather(mi.UInt32, labels, x + side * (y + side * z), deeper)
-            for ghost, total in zip((before, after), sums, strict=True):
-                error = ray_errors(ghost, ray, sample, fit.held_out)
+            for appearance, total in zip((before, after), sums, strict=True):
+                error = ray_errors(appearance, ray, sample, fit.held_out)
                 dr.scatter_reduce(dr.ReduceOp.Add, total, error, hollow, deeper)
             dr.eval(sums)
     return np.stack([total.numpy() for total in sums])

@@ -1,7 +1,7 @@
 """What to hollow out of a visual hull: a minimum cut between outside and inside of what a fog shows.
 
 Both a fold of a garment and its inside are empty and in sight, but only the fold is outside of the template:
-the inside lies behind an opening that the radiance ghost has found. So the outside starts at the hull, the
+the inside lies behind an opening that the openings stage has found. So the outside starts at the hull, the
 inside behind the openings and where nothing is seen, and the boundary runs where cutting is cheap: through
 what is opaque (Boykov and Kolmogorov, ICCV 2003).
 """

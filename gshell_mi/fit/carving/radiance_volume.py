@@ -21,9 +21,9 @@ from ...compat import mesh_scene
 from ...images import decibels
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
-from ..ghost.contrast import Contrast
-from ..ghost.pixels import PixelPool
-from ..lanes import chosen_lanes
+from ..radiance.contrast import Contrast
+from ..radiance.lanes import chosen_lanes
+from ..radiance.pixels import PixelPool
 
 if TYPE_CHECKING:
     from ..stages.cavities import CavitiesConfig

@@ -1,6 +1,6 @@
-"""Vessels: openings of the ghost that lead into the hollow of something solid, such as a mug's mouth.
+"""Vessels: openings that lead into the hollow of something solid, such as a mug's mouth.
 
-Where the hull's cap does not look like the object the ghost opens it. What is seen through it then is the
+Where the hull's cap does not look like the object it is opened. What is seen through it then is the
 back of the hull's walls, as if these were as thin as cloth. The inside of a mug is nearer than that, by the
 thickness of its wall, so every view sees it elsewhere. Therefore each space behind openings is also tried as
 a hollow: all of the hull goes but a wall. If that explains unseen views much better, the space is a hollow,
@@ -19,13 +19,13 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from ...template.msdf import msdf_from_template, splat_to_lattice
 from ...topology import equal_patches
-from ..ghost.ghost_template import GhostTemplate, ghost_template
-from ..ghost.opening import msdf_from_template, splat_to_lattice
-from ..ghost.radiance_ghost import RadianceGhost
+from ..radiance.surface_radiance import SurfaceRadiance
 from ..stage import Fit
 from ..surface import Seen, Surface
-from .fitted_ghost import fitted_ghost, ray_errors
+from ..template import Template, template_of
+from .fitted_radiance import fitted_radiance, ray_errors
 from .hollows import hollowed
 
 #: Thickness of a wall, in cells, that tells vessels; those that are tried for them then.
@@ -59,14 +59,15 @@ def hollowed_vessels(fit: Fit, surface: Surface, gain: float) -> Surface | None:
     Returns:
         The hollowed surface and what was seen of it; None if no opening leads into a hollow.
     """
-    template = ghost_template(fit.scene.subject, surface)
+    template = template_of(fit.scene.subject, surface)
     if template.solid.all() or not template.solid.any() or not gain:
         return None
     vessel = _Trials(fit, surface, template, gain).best()
     if vessel is None:
         return None
     carved, lattice = vessel.template, surface.lattice
-    radiance, found = splat_to_lattice(mi.Float(vessel.ghost.radiance()[0].ravel()), carved.mesh, lattice)
+    front, _ = vessel.appearance.radiance()
+    radiance, found = splat_to_lattice(mi.Float(front.ravel()), carved.mesh, lattice)
     msdf = msdf_from_template(carved.logits, carved.mesh, lattice)
     seen = Seen(radiance.numpy().reshape(-1, 3), found.numpy(), surface.seen.light)
     return replace(vessel.surface.with_fields(msdf=msdf.numpy()), seen=seen)
@@ -98,14 +99,14 @@ class _Vessel:
     Attributes:
         surface: what it comes from, but for the openings that are none.
         template: without the openings into the hollow.
-        ghost: fitted to it.
+        appearance: fitted to it.
         errors: (V,) of rays, by the vertex of the template without the hollow that they meet first.
     """
 
     hollow: _Hollow
     surface: Surface
-    template: GhostTemplate
-    ghost: RadianceGhost
+    template: Template
+    appearance: SurfaceRadiance
     errors: np.ndarray
 
     @property
@@ -117,7 +118,7 @@ class _Vessel:
 class _Trials:
     """Tries hollows behind the openings of a template; arguments as of ``hollowed_vessels``."""
 
-    def __init__(self, fit: Fit, surface: Surface, template: GhostTemplate, gain: float):
+    def __init__(self, fit: Fit, surface: Surface, template: Template, gain: float):
         self.fit, self.surface, self.template, self.gain = fit, surface, template, gain
         self.lattice = surface.lattice
         batch = max(round(_BATCH * fit.config.radiance.batch), 1)
@@ -168,9 +169,9 @@ class _Trials:
             return None
         surface = hollowed(self.surface, hollow.distance)
         closed = replace(self.template, logits=np.where(mouth, _CERTAIN, self.template.logits))
-        carved = ghost_template(self.fit.scene.subject, surface, like=closed)
-        ghost = self._fitted(carved)
-        return _Vessel(hollow, surface, carved, ghost, self._errors(ghost)[0])
+        carved = template_of(self.fit.scene.subject, surface, like=closed)
+        appearance = self._fitted(carved)
+        return _Vessel(hollow, surface, carved, appearance, self._errors(appearance)[0])
 
     def _hollow(self, mouth: np.ndarray, thickness: float, depth: float) -> _Hollow | None:
         """What lies behind openings and deeper than a wall; None if that is nothing."""
@@ -198,11 +199,11 @@ class _Trials:
         np.add.at(votes, (opening[mouth], space[mouth]), 1)
         return _Hollow(mouth, thickness, to_mouth[inside].max(), distance, votes.argmax(axis=1)[opening])
 
-    def _fitted(self, template: GhostTemplate) -> RadianceGhost:
-        return fitted_ghost(template, self.fit, self.config, rounds=_ROUNDS)
+    def _fitted(self, template: Template) -> SurfaceRadiance:
+        return fitted_radiance(template, self.fit, self.config, rounds=_ROUNDS)
 
-    def _errors(self, ghost: RadianceGhost) -> tuple[np.ndarray, np.ndarray]:
-        """(V,) sums of a ghost's errors, and numbers of rays, by the vertex that these meet first."""
+    def _errors(self, appearance: SurfaceRadiance) -> tuple[np.ndarray, np.ndarray]:
+        """(V,) sums of a template's errors, and numbers of rays, by the vertex that these meet first."""
         pixels, seed = self.fit.held_out, self.fit.config.seed
         errors, rays = (dr.zeros(mi.Float, len(self.template.vertices)) for _ in range(2))
         vertex = mi.UInt32(self.template.faces[:, 0].astype(np.uint32))
@@ -214,7 +215,7 @@ class _Trials:
                 # On a GPU, a kernel traces rays in one scene only.
                 dr.eval(hit)
                 first = dr.gather(mi.UInt32, vertex, hit.prim_index, hit.is_valid())
-                error = ray_errors(ghost, ray, sample, pixels)
+                error = ray_errors(appearance, ray, sample, pixels)
                 for total, values in ((errors, error), (rays, mi.Float(1))):
                     dr.scatter_reduce(dr.ReduceOp.Add, total, values, first, hit.is_valid())
                 dr.eval(errors, rays)

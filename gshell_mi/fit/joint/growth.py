@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from ...fields.smoothing import MeshDiffusion
 from ...topology import equal_patches, mesh_edges, spread
-from .seen_through import Explained
+from .residuals import Residuals
 
 #: Least share of the rays, smoothed, that a vertex meets of those which half of the surface meets. What few
 #: views see into may as well be a fold whose shape is not known.
@@ -32,7 +32,7 @@ _WALL = 2
 _FEWEST = 12
 
 
-def near_openings(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found: Explained,
+def near_openings(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found: Residuals,
                   smooth: MeshDiffusion, reach: float) -> np.ndarray:
     """(V,) vertices near openings without which the images would be explained about as well.
 

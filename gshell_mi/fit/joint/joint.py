@@ -24,9 +24,9 @@ from ...parametrisation import StepRules, make_parametrisation, parametrisation_
 from ...scene import FitScene
 from ...schedules import decay_at
 from ...tempered_adam import TemperedAdam
+from ...template.msdf import without_specks
 from ...timing import phase
 from ..bookkeeping.observer import Preview
-from ..ghost.opening import without_specks
 from .regularisers import Regularisers, StepView
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from ...fields.smoothing import MeshDiffusion
 from ...fields.visual_hull import visual_hull
 from ...lattice import Lattice
 from ...scene import FitScene
-from ..cut.template_sides import normals_at_vertices
-from ..ghost.ghost_template import GhostTemplate, closed_template
+from ...template.sides import normals_at_vertices
+from ..template import Template, closed_template
 from .volume import RadianceVolume
 
 #: The template is this far outside of what is there, in cells: a sheet, which is seen from both sides, has no
@@ -49,7 +49,7 @@ class VolumeSurface:
         radiance: (V, 3) there.
     """
 
-    template: GhostTemplate
+    template: Template
     positions: np.ndarray
     radiance: np.ndarray
 
@@ -95,7 +95,7 @@ def volume_surface(volume: RadianceVolume, scene: FitScene, lattice: Lattice,
     inwards = [smooth(mi.Float(np.ascontiguousarray(column, np.float32))).numpy()
                for column in normals_at_vertices(vertices, faces).T]
     back = vertices - margin * cell * np.stack(inwards, axis=1)
-    template = GhostTemplate(mesh, vertices, faces, np.ones(len(vertices)), back)
+    template = Template(mesh, vertices, faces, np.ones(len(vertices)), back)
     return VolumeSurface(template, back, volume.radiance_at(back))
 
 

@@ -7,9 +7,9 @@ import mitsuba as mi
 import numpy as np
 
 from ...fields.mask_outline import mask_distance, sharp
+from ...template.normals import vertex_normals
 from ...topology import mesh_edges
 from ...views import PinholeViews
-from ..ghost.mesh_normals import vertex_normals
 
 #: A contour point belongs to the outer silhouette if the ray this many pixels beyond it meets nothing.
 _CLEARANCE = 1.5

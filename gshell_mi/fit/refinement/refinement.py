@@ -3,7 +3,7 @@
 A visual hull bridges every fold and every hollow. There the views disagree on the radiance of a point, as
 they see different points of the object through it. Derivatives of the interpolated radiance with respect to
 the vertices pull the surface to where the views agree; a Sobolev gradient carries whole regions along,
-which a pixel's own derivative would not reach. As in the radiance ghost there is neither light nor
+which a pixel's own derivative would not reach. As in the openings stage there is neither light nor
 material, hence no noise, and a step looks at all views at once.
 """
 
@@ -24,8 +24,8 @@ from ...outliers import trusted
 from ...schedules import falling
 from ...triangles import face_areas
 from ..bookkeeping.observer import Preview
-from ..ghost.radiance_ghost import RadianceGhost
-from ..ghost.sheets import Sheet
+from ..radiance.layers import Sheet
+from ..radiance.surface_radiance import SurfaceRadiance
 from .outlines import Outlines
 
 if TYPE_CHECKING:
@@ -42,10 +42,10 @@ _FACTORISE_EVERY = 64
 
 
 class PhotometricRefinement:
-    """Adam on the vertex positions and the radiance of a ghost whose opacity rests.
+    """Adam on the vertex positions and the radiance of a surface whose opacity rests.
 
     Args:
-        ghost: fitted, with its opacity decided.
+        appearance: fitted, with its opacity decided.
         vertices: (V, 3) world positions to start from.
         faces: (F, 3) of the watertight template.
         outlines: the masks; None if the targets have none.
@@ -54,9 +54,9 @@ class PhotometricRefinement:
         seed: of the views whose outlines a step compares.
     """
 
-    def __init__(self, ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray,
+    def __init__(self, appearance: SurfaceRadiance, vertices: np.ndarray, faces: np.ndarray,
                  outlines: Outlines | None, length: float, config: RefinementConfig, seed: int = 0):
-        self.ghost, self.faces, self.outlines, self.config = ghost, faces, outlines, config
+        self.appearance, self.faces, self.outlines, self.config = appearance, faces, outlines, config
         self.seed = seed
         self.length = length
         area = face_areas(vertices, faces).sum()
@@ -69,24 +69,25 @@ class PhotometricRefinement:
 
     def step(self, iteration: int) -> dict[str, float]:
         """One step on random pixels of all views; returns the losses."""
-        config, ghost, optimizer = self.config, self.ghost, self.optimizer
+        config, appearance, optimizer = self.config, self.appearance, self.optimizer
         progress = iteration / config.iterations
         positions = optimizer["positions"]
-        ghost.move(dr.detach(positions))
-        sample, sheets = ghost.look(iteration)
+        appearance.move(dr.detach(positions))
+        sample, sheets = appearance.look(iteration)
         attached = [replace(sheet, weights=_barycentric(positions, sheet)) for sheet in sheets]
-        radiance, _ = ghost.composite(attached, dr.width(sample.view))
-        share = ghost.pixels.share
+        radiance, _ = appearance.composite(attached, dr.width(sample.view))
+        share = appearance.pixels.share
         image = share * losses.log_l1(radiance, sample.radiance)
         total, outline = image, mi.Float(0)
         if self.outlines:
-            chosen = np.random.default_rng((self.seed, iteration)).permutation(len(ghost.views))
-            outline = self.outlines.loss(positions, ghost.scene, chosen[:_OUTLINE_VIEWS]) / self.length**2
+            chosen = np.random.default_rng((self.seed, iteration)).permutation(len(appearance.views))
+            outline = self.outlines.loss(positions, appearance.scene, chosen[:_OUTLINE_VIEWS])
+            outline = outline / self.length**2
             # Silhouettes lead at first, while the radiance is still that of the wrong place.
             total = total + dr.opaque(mi.Float, (1 - progress / 2) * config.outline) * outline
         dr.backward(total)
         self._move(progress, iteration)
-        ghost.update(("radiance",), config.radiance_lr)
+        appearance.update(("radiance",), config.radiance_lr)
         error = share * mean(dr.square(dr.detach(radiance) - sample.radiance))
         return {"loss": total[0], "image": image[0], "outline": outline[0],
                 "psnr": decibels(error[0])}
@@ -96,15 +97,15 @@ class PhotometricRefinement:
         return self.optimizer["positions"].numpy().reshape(-1, 3)
 
     def preview(self) -> Preview:
-        """The ghost's, where it is now."""
-        return self.ghost.preview()
+        """The surface, where it is now."""
+        return self.appearance.preview()
 
     def _move(self, progress: float, iteration: int) -> None:
         config, optimizer = self.config, self.optimizer
         if self._diffuse is None or iteration % _FACTORISE_EVERY == 0:
             start = (iteration - iteration % _FACTORISE_EVERY) / config.iterations
             smoothing = falling(config.smoothing, config.detail, start)
-            self._diffuse = MeshDiffusion(self.faces, self.ghost.vertex_count, self._density * smoothing)
+            self._diffuse = MeshDiffusion(self.faces, self.appearance.vertex_count, self._density * smoothing)
         gradient = trusted(dr.grad(optimizer["positions"]), _OUTLIER)
         dr.set_grad(optimizer["positions"], self._diffuse(gradient))
         decay = 0.5 * (1 + np.cos(np.pi * progress))

@@ -14,9 +14,9 @@ from ..bounds import Between
 from ..carving.carving import carve
 from ..carving.radiance_volume import RadianceVolume
 from ..carving.vessels import hollowed_vessels
-from ..ghost.ghost_template import closed_template
 from ..stage import Fit, Steps
 from ..surface import Surface
+from ..template import closed_template
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from ...lattice import BlockLattice, Lattice, lattice_of
 from ...light import EnvironmentLight
 from ...material import GivenMaterial, MaterialField, given_material
 from ...scene import FitScene
+from ...template.msdf_transfer import transfer_msdf
 from ..bounds import Between
-from ..cut.recut import recut
 from ..joint.joint import JointStage
-from ..joint.second_look import SecondLook
+from ..joint.topology_revision import TopologyRevision
 from ..stage import Fit, Steps
 from ..surface import TYPICAL_REFLECTANCE, Surface
 
@@ -127,7 +127,8 @@ class Joint:
                     joint.geometry.fit_step(iteration)
                     advance()
                 joint.geometry.begin()
-        revision = SecondLook(joint, fit.views, fit.pixels, _under(steps.kept, _REVISION) or surface.revision)
+        revised = _under(steps.kept, _REVISION) or surface.revision
+        revision = TopologyRevision(joint, fit.views, fit.pixels, revised)
         steps.run(revision, self.iterations, joint.optimizers, lambda: (
             _prefixed(_REVISION, revision.state()) | _prefixed(_BLOCKS, block_arrays(subject.fields()))
             | joint.detail_arrays()))
@@ -156,7 +157,7 @@ def start_fields(subject: mi.Shape, surface: Surface, lattice: Lattice, band_res
     if fields.lattice == lattice:
         return fields.in_blocks() if in_blocks else fields
     resample = fields.in_blocks if in_blocks else fields.to_lattice
-    return recut(subject, fields, resample(lattice.resolution))
+    return transfer_msdf(subject, fields, resample(lattice.resolution))
 
 
 def block_arrays(fields: LatticeFields) -> dict[str, np.ndarray]:

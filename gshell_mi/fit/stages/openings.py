@@ -23,15 +23,15 @@ from ...errors import UserError
 from ...images import decibels
 from ...means import mean
 from ...schedules import decay_at
+from ...template.msdf import clean_opacity, msdf_from_template, splat_to_lattice
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
-from ..ghost.ghost_template import ghost_template
-from ..ghost.justified import close_unjustified, open_unjustified
-from ..ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice
-from ..ghost.pixels import FAINT
-from ..ghost.radiance_ghost import RadianceGhost
+from ..radiance.acceptance import close_rejected, open_rejected
+from ..radiance.pixels import FAINT
+from ..radiance.surface_radiance import SurfaceRadiance
 from ..stage import Fit, Steps
 from ..surface import TYPICAL_REFLECTANCE, Seen, Surface
+from ..template import template_of
 
 #: Logit, at most, of what has been justified before.
 _OPEN = -1.0
@@ -76,24 +76,24 @@ class Openings:
             UserError: nothing opaque was found.
         """
         closed = surface.with_fields(msdf=np.ones_like(surface.fields.sdf))
-        template = ghost_template(fit.scene.subject, closed)
+        template = template_of(fit.scene.subject, closed)
         vertices, faces, count = template.vertices, template.faces, self.config.iterations
-        ghost = RadianceGhost(template.start, faces, fit.views, fit.pixels, fit.config.radiance,
-                              seed=fit.config.seed)
-        training = OpacityTraining(ghost, self.config)
+        appearance = SurfaceRadiance(template.start, faces, fit.views, fit.pixels, fit.config.radiance,
+                                     seed=fit.config.seed)
+        training = OpacityTraining(appearance, self.config)
         if not fit.config.watertight:
-            steps.run(training, count, {"radiance": ghost.optimizer})
+            steps.run(training, count, {"radiance": appearance.optimizer})
         with steps.task("verdict"):
             logits = np.ones(len(vertices))
             if not fit.config.watertight:
-                logits = find_openings(ghost, vertices, faces, self.config, fit.config.min_area,
+                logits = find_openings(appearance, vertices, faces, self.config, fit.config.min_area,
                                        lambda again: steps.repeat(training, count, again * count))
             opened = logits <= 0
-            ghost.refit(~opened)
+            appearance.refit(~opened)
         if opened.all():
             raise UserError(f"There is nothing opaque in '{fit.scene.path}'; give the fit more steps with "
                             f"--openings.iterations, or check the cameras.")
-        front, _ = ghost.radiance()
+        front, _ = appearance.radiance()
         msdf = msdf_from_template(logits, template.mesh, surface.lattice)
         radiance, known = splat_to_lattice(mi.Float(front.ravel()), template.mesh, surface.lattice)
         light = np.float32(float(np.median(front[~opened].mean(axis=1))) / TYPICAL_REFLECTANCE)
@@ -104,21 +104,21 @@ class Openings:
 class OpacityTraining:
     """Trains opacity and radiance together, on random pixels of all views."""
 
-    def __init__(self, ghost: RadianceGhost, config: OpeningsConfig):
-        self.ghost, self.config = ghost, config
+    def __init__(self, appearance: SurfaceRadiance, config: OpeningsConfig):
+        self.appearance, self.config = appearance, config
 
     def step(self, iteration: int) -> dict[str, float]:
         """One Adam step on a batch of random pixels; returns the losses."""
-        config, ghost = self.config, self.ghost
+        config, appearance = self.config, self.appearance
         progress = iteration / config.iterations
-        sample, radiance, alpha, _ = ghost.render(iteration)
-        share, weight = ghost.pixels.share, ghost.pixels.mask_weight
-        image = share * losses.l1(ghost.tone(radiance), ghost.tone(sample.radiance))
+        sample, radiance, alpha, _ = appearance.render(iteration)
+        share, weight = appearance.pixels.share, appearance.pixels.mask_weight
+        image = share * losses.l1(appearance.tone(radiance), appearance.tone(sample.radiance))
         mask = share * losses.mask_l2(alpha, sample.alpha)
         # Where a mask shows daylight within the hull, every sheet on the ray is open: no doubt, no balance.
         daylight = share * losses.mask_l2(dr.select(sample.alpha < FAINT, alpha, 0), 0)
-        opacity = sigmoid(ghost.optimizer["opacity"])
-        front, back = (softplus(side) for side in ghost.sides())
+        opacity = sigmoid(appearance.optimizer["opacity"])
+        front, back = (softplus(side) for side in appearance.sides())
         # Undecided opacity must have its say first; only then is it made to decide.
         late = dr.opaque(mi.Float, max(0.0, 2 * progress - 1))
         total = (
@@ -130,22 +130,22 @@ class OpacityTraining:
             + config.chroma * losses.chroma_difference(front, back)
         )
         dr.backward(total)
-        ghost.update(("opacity", "radiance"), ghost.config.lr * decay_at(progress))
+        appearance.update(("opacity", "radiance"), appearance.config.lr * decay_at(progress))
         error = share * mean(dr.square(dr.detach(radiance) - sample.radiance))
         return {"loss": total[0], "image": image[0], "mask": mask[0],
                 "psnr": decibels(error[0])}
 
     def preview(self) -> Preview:
         """What is not clearly fading."""
-        return self.ghost.preview()
+        return self.appearance.preview()
 
 
-def find_openings(ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray, config: OpeningsConfig,
-                  min_area: float, train: Callable[[int], None]) -> np.ndarray:
+def find_openings(appearance: SurfaceRadiance, vertices: np.ndarray, faces: np.ndarray,
+                  config: OpeningsConfig, min_area: float, train: Callable[[int], None]) -> np.ndarray:
     """Where the images justify an opening.
 
     Args:
-        ghost: after its training; it is trained further.
+        appearance: after its training; it is trained further.
         vertices, faces: (V, 3) and (F, 3) of its template.
         config: ``gain`` and ``rounds``.
         min_area: cuts and islands that are undone, as of ``clean_opacity``.
@@ -160,13 +160,13 @@ def find_openings(ghost: RadianceGhost, vertices: np.ndarray, faces: np.ndarray,
     opened, unjustified = (np.zeros(len(vertices), bool) for _ in range(2))
     for trained_again in range(rounds + 1):
         if trained_again:
-            ghost.begin_again(unjustified, opened)
+            appearance.begin_again(unjustified, opened)
             train(trained_again)
-        proposed = clean(ghost.smoothed_logits())
+        proposed = clean(appearance.smoothed_logits())
         proposed = np.where(opened, np.minimum(proposed, _OPEN), proposed)
         logits = proposed
-        for judge in (close_unjustified, open_unjustified):
-            logits = clean(judge(logits, faces, ghost.image_error, gain))
+        for judge in (close_rejected, open_rejected):
+            logits = clean(judge(logits, faces, appearance.image_error, gain))
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
         unjustified |= (proposed <= 0) & (logits > 0)

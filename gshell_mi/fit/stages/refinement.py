@@ -12,13 +12,13 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 
-from ..ghost.ghost_template import GhostTemplate, ghost_template
-from ..ghost.radiance_ghost import RadianceGhost
-from ..refinement.descent import Descent
+from ..radiance.surface_radiance import SurfaceRadiance
+from ..refinement.early_stopping import EarlyStopping
 from ..refinement.outlines import Outlines
 from ..refinement.refinement import PhotometricRefinement
 from ..stage import Fit, Steps
 from ..surface import Moved, Surface
+from ..template import Template, template_of
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,13 @@ class Refinement:
         if not self.config.iterations or not (self.first or surface.moved):
             return surface
         steps.fact(f"{self.name}_kept", False)
-        template = ghost_template(fit.scene.subject, surface)
-        ghost = RadianceGhost(template.start, template.faces, fit.views, fit.training, fit.config.radiance,
-                              seed=fit.config.seed, glossy=True)
-        before = self._standing(ghost, template, fit) if self.first else surface.moved[0]
+        template = template_of(fit.scene.subject, surface)
+        appearance = SurfaceRadiance(template.start, template.faces, fit.views, fit.training,
+                                     fit.config.radiance, seed=fit.config.seed, glossy=True)
+        before = self._standing(appearance, template, fit) if self.first else surface.moved[0]
         if not self.first:
-            ghost.take_over(before.positions, before.fitted, template.solid)
-        after = self._moved(ghost, template, before.positions, fit, steps, fit.cell(surface))
+            appearance.take_over(before.positions, before.fitted, template.solid)
+        after = self._moved(appearance, template, before.positions, fit, steps, fit.cell(surface))
         better = after is not None and after.error < self.config.gain * before.error
         if self.first:
             return replace(surface, moved=(after,)) if better else surface
@@ -91,34 +91,35 @@ class Refinement:
             return surface
         return replace(surface, moved=(after, before) if better else (before, after))
 
-    def _standing(self, ghost: RadianceGhost, template: GhostTemplate, fit: Fit) -> Moved:
+    def _standing(self, appearance: SurfaceRadiance, template: Template, fit: Fit) -> Moved:
         """The template at rest, with a radiance fitted anew."""
-        ghost.move(mi.Float(template.start.ravel()))
-        ghost.refit_anew(template.solid)
-        return self._seen(ghost, template.start, fit)
+        appearance.move(mi.Float(template.start.ravel()))
+        appearance.refit_anew(template.solid)
+        return self._seen(appearance, template.start, fit)
 
-    def _moved(self, ghost: RadianceGhost, template: GhostTemplate, positions: np.ndarray, fit: Fit,
+    def _moved(self, appearance: SurfaceRadiance, template: Template, positions: np.ndarray, fit: Fit,
                steps: Steps, cell: float) -> Moved | None:
         """The template after the steps; None if they get nowhere."""
         outlines = None
         if fit.training.has_alpha:
             outlines = Outlines(fit.views, fit.alphas, template.faces, template.solid)
-        refinement = PhotometricRefinement(ghost, positions, template.faces, outlines, cell, self.config,
+        refinement = PhotometricRefinement(appearance, positions, template.faces, outlines, cell, self.config,
                                            fit.config.seed)
         run = partial(steps.run, count=self.config.iterations,
-                      optimizers={"radiance": ghost.optimizer, "refinement": refinement.optimizer})
+                      optimizers={"radiance": appearance.optimizer, "refinement": refinement.optimizer})
         if self.config.descent is None:
             run(refinement)
         else:
-            watched = Descent(refinement, self.config.iterations, self.config.descent, steps.kept)
+            watched = EarlyStopping(refinement, self.config.iterations, self.config.descent, steps.kept)
             run(watched, state=watched.state, stalled=watched.stalled)
             if watched.stalled(self.config.iterations):
                 return None
         with steps.task("verdict"):
-            ghost.move(mi.Float(refinement.positions().ravel()))
-            ghost.refit(template.solid)
-            return self._seen(ghost, refinement.positions(), fit)
+            appearance.move(mi.Float(refinement.positions().ravel()))
+            appearance.refit(template.solid)
+            return self._seen(appearance, refinement.positions(), fit)
 
-    def _seen(self, ghost: RadianceGhost, positions: np.ndarray, fit: Fit) -> Moved:
-        radiance, _ = ghost.radiance()
-        return Moved(self.name, positions, radiance, ghost.unexplained(fit.held_out), ghost.fitted())
+    def _seen(self, appearance: SurfaceRadiance, positions: np.ndarray, fit: Fit) -> Moved:
+        radiance, _ = appearance.radiance()
+        error = appearance.unexplained(fit.held_out)
+        return Moved(self.name, positions, radiance, error, appearance.fitted())

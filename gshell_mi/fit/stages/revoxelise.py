@@ -13,15 +13,15 @@ import numpy as np
 
 from ...fields import LatticeFields
 from ...lattice import Lattice
+from ...template.msdf import clean_opacity
+from ...template.revoxelise import revoxelise
+from ...template.thin_sheets import Cut, collapsed_sheets
+from ...template.unseen import without_unseen
 from ...topology import topology
 from ...triangles import positive_part
-from ..cut.recast import recast
-from ..cut.spare_sides import Cut, without_spare_sides
-from ..cut.unseen import without_unseen
-from ..ghost.ghost_template import GhostTemplate, ghost_template
-from ..ghost.opening import clean_opacity
 from ..stage import Fit, Steps
 from ..surface import Moved, Seen, Surface
+from ..template import Template, template_of
 
 
 class Revoxelise:
@@ -34,7 +34,7 @@ class Revoxelise:
         back."""
         surface = surface.on_grid(fit.lattices.late.grid)
         with steps.task():
-            template = ghost_template(fit.scene.subject, surface)
+            template = template_of(fit.scene.subject, surface)
             radiance = template.mesh.interpolate(mi.Float(surface.seen.radiance.ravel()), 3).numpy().T
             still = Moved("start", template.start, radiance, np.inf)
             found, taken = best_revoxelised(fit, template, (*surface.moved, still), surface.lattice,
@@ -45,7 +45,7 @@ class Revoxelise:
             return without_unseen_parts(fit, found or replace(surface, hull=None, moved=()))
 
 
-def best_revoxelised(fit: Fit, template: GhostTemplate, moved: Iterable[Moved], lattice: Lattice,
+def best_revoxelised(fit: Fit, template: Template, moved: Iterable[Moved], lattice: Lattice,
                      light: np.float32) -> tuple[Surface | None, str]:
     """The first movement of a template of which fields can be made, cut as well as can be.
 
@@ -64,8 +64,8 @@ def best_revoxelised(fit: Fit, template: GhostTemplate, moved: Iterable[Moved], 
         if (candidate.positions == template.vertices).all():
             continue
         for cut in _cuts(fit, template, candidate.positions, lattice.spacing * subject.length_scale):
-            fields = recast(subject, lattice, template.vertices, cut.positions, template.faces, cut.logits,
-                            candidate.radiance, min_area, cut.topology, cut.fewest_loops)
+            fields = revoxelise(subject, lattice, template.vertices, cut.positions, template.faces,
+                                cut.logits, candidate.radiance, min_area, cut.topology, cut.fewest_loops)
             if fields:
                 closed = LatticeFields.closed(fields["sdf"], lattice.grid)
                 seen = Seen(fields["radiance"], fields["known"], light)
@@ -81,7 +81,7 @@ def without_unseen_parts(fit: Fit, surface: Surface) -> Surface:
     return surface if msdf is None else surface.with_fields(msdf=msdf.numpy())
 
 
-def _cuts(fit: Fit, template: GhostTemplate, moved: np.ndarray, cell: float) -> list[Cut]:
+def _cuts(fit: Fit, template: Template, moved: np.ndarray, cell: float) -> list[Cut]:
     """How to cut a moved template, the best first."""
     config = fit.config
     # What has become too small by moving is noise, and no reason to leave all where it was.
@@ -90,6 +90,6 @@ def _cuts(fit: Fit, template: GhostTemplate, moved: np.ndarray, cell: float) -> 
     as_found = Cut(logits, moved, found, found.boundary_loops)
     if config.watertight or not config.sheet_thickness:
         return [as_found]
-    cut = without_spare_sides(as_found, template.vertices, template.faces, cell, config.sheet_thickness,
-                              config.min_area)
+    cut = collapsed_sheets(as_found, template.vertices, template.faces, cell, config.sheet_thickness,
+                           config.min_area)
     return [cut, as_found] if cut else [as_found]

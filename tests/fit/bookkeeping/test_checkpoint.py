@@ -17,7 +17,7 @@ from gshell_mi.fit.bookkeeping.checkpoint import FORMAT, Checkpoint, optimizer_a
 def checkpoint() -> Checkpoint:
     rng = np.random.default_rng(0)
     arrays = {"sdf": rng.normal(size=27).astype(np.float32), "known": np.array([True, False]),
-              "ghost/opacity/step": np.array([3], np.uint32)}
+              "appearance/opacity/step": np.array([3], np.uint32)}
     return Checkpoint("openings", 17, {"seed": 3, "resolution": None, "spp": 8, "warmup": 0.15}, arrays,
                       {"hull": 1.25})
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from gshell_mi.fit.carving import carving
 from gshell_mi.fit.carving.carving import carve
 from gshell_mi.fit.carving.radiance_volume import RadianceVolume
-from gshell_mi.fit.ghost.ghost_template import ghost_template
+from gshell_mi.fit.template import template_of
 from gshell_mi.lattice import make_lattice
 
 RESOLUTION = 32
@@ -45,7 +45,7 @@ def test_a_cup_is_found(trained):
     sdf = carved.fields.sdf.reshape((RESOLUTION + 1,) * 3)
     centre, half_depth = RESOLUTION // 2, round(0.5 * HALF / CELL)
     assert sdf[centre, centre + half_depth, centre] > 0 > sdf[centre, centre - half_depth, centre]
-    found = ghost_template(subject, carved)
+    found = template_of(subject, carved)
     inner = np.abs(found.start).max(axis=1) < HALF - 0.25 * CELL
     truth, _ = trimesh.sample.sample_surface(cup(), 40000, seed=1)
     distance = cKDTree(truth).query(found.start[inner])[0]
@@ -64,7 +64,7 @@ def test_hollows_have_to_be_justified(trained, monkeypatch):
 
 def test_openings_that_there_were_stay(trained, monkeypatch):
     """Whatever is said of new ones; the bottom has one here."""
-    monkeypatch.setattr(carving, "close_unjustified", lambda logits, *_: np.abs(logits))
+    monkeypatch.setattr(carving, "close_rejected", lambda logits, *_: np.abs(logits))
     _, y, _ = LATTICE.vertex_positions().T
     msdf = np.where(y < -HALF + CELL, -CELL, CELL).astype(np.float32)
     fields = trained(cup, msdf=msdf)[2].fields
@@ -81,10 +81,10 @@ def test_new_parts_are_solid_and_old_ones_keep_their_opacity():
     hull, _, _ = hull_of(RESOLUTION)
     z = np.repeat(np.linspace(-1, 1, RESOLUTION + 1), (RESOLUTION + 1) ** 2).astype(np.float32)
     surface = surface_of(hull, z * CELL)
-    before = ghost_template(subject, surface)
+    before = template_of(subject, surface)
     hole = 0.3 - np.linalg.norm(subject.lattice.vertex_positions(), axis=1)
     carved = surface.with_fields(sdf=np.maximum(surface.fields.sdf, hole).astype(np.float32))
-    after = ghost_template(subject, carved, like=before)
+    after = template_of(subject, carved, like=before)
     inner = np.abs(after.vertices).max(axis=1) < 0.45
     assert inner.any() and after.solid[inner].all()
     np.testing.assert_array_equal(after.solid[~inner], after.vertices[~inner, 2] > 0)
@@ -94,7 +94,7 @@ def test_the_shape_may_have_another_lattice_and_stays_as_it_is():
     """As that of a fit with --grid or --resolution has: it comes from the scene's file."""
     subject = mi.load_dict({"type": "gshell", "resolution": 12})
     lattice, hull = subject.lattice, hull_of(RESOLUTION)[0]
-    found = ghost_template(subject, surface_of(hull, np.full_like(hull, 2 * CELL), "cube"))
+    found = template_of(subject, surface_of(hull, np.full_like(hull, 2 * CELL), "cube"))
     assert subject.lattice is lattice
     np.testing.assert_allclose(found.logits, 2, rtol=1e-5)
 

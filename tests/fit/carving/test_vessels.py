@@ -8,7 +8,7 @@ from cup import CONFIG, HALF, WALL, block, cup, fit_of, surface_of
 from scipy.spatial import cKDTree
 
 from gshell_mi.fit.carving.vessels import hollowed_vessels
-from gshell_mi.fit.ghost.ghost_template import ghost_template
+from gshell_mi.fit.template import template_of
 from gshell_mi.topology import topology
 from gshell_mi.triangles import positive_part
 
@@ -46,7 +46,7 @@ def vessels(shape: trimesh.Trimesh, fields, resolution: int = RESOLUTION,
     subject = mi.load_dict({"type": "gshell", "resolution": resolution})
     surface = surface_of(*fields(subject.lattice.points(mi.Float).numpy().T))
     hollowed = hollowed_vessels(fit_of(subject, shape), surface, gain)
-    return hollowed and ghost_template(subject, hollowed)
+    return hollowed and template_of(subject, hollowed)
 
 
 def block_open_above(points):

@@ -8,7 +8,7 @@ from cap import cap
 
 from gshell_mi.fields.smoothing import MeshDiffusion
 from gshell_mi.fit.joint.growth import grown, joined, near_openings
-from gshell_mi.fit.joint.seen_through import Explained
+from gshell_mi.fit.joint.residuals import Residuals
 from gshell_mi.topology import topology
 from gshell_mi.triangles import positive_part
 
@@ -65,10 +65,10 @@ def test_what_lies_apart_is_joined_by_a_narrow_way(ball):
 # --- where
 
 
-def evidence(ball, empty: np.ndarray) -> Explained:
+def evidence(ball, empty: np.ndarray) -> Residuals:
     """The surface is explained badly where it is empty, and then what is behind it hardly worse."""
     now = np.where(empty, 4.0, 1.0)
-    return Explained(np.full(len(empty), 50.0), 50 * now, 50 * np.where(empty, 6.0, 40.0))
+    return Residuals(np.full(len(empty), 50.0), 50 * now, 50 * np.where(empty, 6.0, 40.0))
 
 
 @pytest.mark.parametrize(("reach", "apart"), [(0.5, False), (3.0, True)])
@@ -103,7 +103,7 @@ def test_what_is_not_clearly_empty_stays(ball, change):
     found = evidence(ball, wide)
     found = {"explained as well as the rest": replace(found, now=found.rays, without=2 * found.rays),
              "much worse without": replace(found, without=np.where(wide, 20 * found.now, found.without)),
-             "hardly met": Explained(*(np.where(wide, 0.3, 1) * sums
+             "hardly met": Residuals(*(np.where(wide, 0.3, 1) * sums
                                        for sums in (found.rays, found.now, found.without)))}[change]
     smooth = MeshDiffusion(ball.faces, len(up), 0.5)
     assert not near_openings(np.where(up, -1.0, 1.0), ball.vertices, ball.faces, found, smooth, 3.0).any()

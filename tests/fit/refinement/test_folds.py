@@ -7,7 +7,7 @@ import pytest
 from bowl import CLOSED, SHORT
 
 from gshell_mi.fit.__main__ import main
-from gshell_mi.fit.refinement.descent import Descent
+from gshell_mi.fit.refinement.early_stopping import EarlyStopping
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement
 from gshell_mi.fit.stages.refinement import FoldsConfig, RefinementConfig
 
@@ -102,14 +102,14 @@ class Losses:
 def test_the_losses_before_a_quarter_decide(later, stalled):
     """Of 64 steps the first two, and those before the 16th."""
     losses = Losses(np.r_[1.1, 0.9, np.full(12, 7.0), later + 0.1, later - 0.1, np.full(48, 7.0)])
-    whole = Descent(losses, 64, 0.99, {})
+    whole = EarlyStopping(losses, 64, 0.99, {})
     for i in range(16):
         assert not whole.stalled(i)
         whole.step(i)
     assert whole.stalled(16) == stalled
 
-    parts = Descent(losses, 64, 0.99, {})
+    parts = EarlyStopping(losses, 64, 0.99, {})
     for i in range(16):
-        parts = Descent(losses, 64, 0.99, parts.state())
+        parts = EarlyStopping(losses, 64, 0.99, parts.state())
         parts.step(i)
     assert parts.stalled(16) == parts.stalled(64) == stalled

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from gshell_mi.fit.ghost.pixels import PixelPool
-from gshell_mi.fit.ghost.radiance_ghost import RadianceConfig, RadianceGhost
-from gshell_mi.fit.ghost.sheets import Sheet
+from gshell_mi.fit.radiance.layers import Sheet
+from gshell_mi.fit.radiance.pixels import PixelPool
+from gshell_mi.fit.radiance.surface_radiance import RadianceConfig, SurfaceRadiance
 from gshell_mi.fit.refinement.outlines import Outlines
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement, _barycentric
 from gshell_mi.fit.stages.refinement import RefinementConfig
@@ -62,10 +62,10 @@ def alphas(targets: list[Target]) -> list[np.ndarray]:
 def refinement(capture, vertices, faces, with_outlines) -> PhotometricRefinement:
     views, pixels, targets = capture
     solid = np.ones(len(vertices), bool)
-    ghost = RadianceGhost(vertices, faces, views, pixels, RADIANCE)
-    ghost.refit(solid)
+    appearance = SurfaceRadiance(vertices, faces, views, pixels, RADIANCE)
+    appearance.refit(solid)
     outlines = Outlines(views, alphas(targets), faces, solid) if with_outlines else None
-    return PhotometricRefinement(ghost, vertices, faces, outlines, CELL, CONFIG)
+    return PhotometricRefinement(appearance, vertices, faces, outlines, CELL, CONFIG)
 
 
 def dented() -> tuple[np.ndarray, np.ndarray]:
@@ -98,9 +98,9 @@ def test_outline_of_the_true_sphere_is_the_masks(capture):
 
     def distance(scale: float) -> float:
         vertices = scale * np.array(mesh.vertices)
-        ghost = RadianceGhost(vertices, faces, views, capture[1], RADIANCE)
+        appearance = SurfaceRadiance(vertices, faces, views, capture[1], RADIANCE)
         outlines = Outlines(views, alphas(targets), faces, np.ones(len(vertices), bool))
-        loss = outlines.loss(mi.Float(vertices.ravel()), ghost.scene, np.arange(len(views)))
+        loss = outlines.loss(mi.Float(vertices.ravel()), appearance.scene, np.arange(len(views)))
         return float(np.sqrt(loss[0])) / pixel
 
     assert distance(1.0) < 0.2
@@ -113,11 +113,11 @@ def test_outline_loss_derivative_is_that_of_a_scaled_sphere(capture):
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=1.05 * RADIUS)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     outlines = Outlines(views, alphas(targets), faces, np.ones(len(vertices), bool))
-    ghost = RadianceGhost(vertices, faces, views, pixels, RADIANCE)
+    appearance = SurfaceRadiance(vertices, faces, views, pixels, RADIANCE)
     every = np.arange(len(views))
 
     def loss(scale):
-        return outlines.loss(mi.Float(vertices.ravel()) * scale, ghost.scene, every)
+        return outlines.loss(mi.Float(vertices.ravel()) * scale, appearance.scene, every)
 
     scale = mi.Float(1)
     dr.enable_grad(scale)
@@ -150,9 +150,9 @@ def test_views_it_did_not_see_judge_the_refinement(capture):
     assert set(np.unique(drawn.view)) == set(np.flatnonzero(unseen))
     errors = []
     for points in (vertices, np.array(sphere.vertices)):
-        ghost = RadianceGhost(points, faces, views, known, RADIANCE)
-        ghost.refit(np.ones(len(points), bool))
-        errors.append(ghost.unexplained(unknown))
+        appearance = SurfaceRadiance(points, faces, views, known, RADIANCE)
+        appearance.refit(np.ones(len(points), bool))
+        errors.append(appearance.unexplained(unknown))
     assert errors[1] < 0.95 * errors[0]
 
 

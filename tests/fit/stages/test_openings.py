@@ -11,7 +11,7 @@ BALL = trimesh.creation.icosphere(4)
 VERTICES, FACES = np.array(BALL.vertices), np.array(BALL.faces)
 
 
-class ScriptedGhost:
+class ScriptedRadiance:
     """Proposes caps: at first those that ``first`` names, and ``behind`` only where ``false`` rests.
 
     Through ``false`` the images are explained worse, through all others better.
@@ -46,8 +46,9 @@ class ScriptedGhost:
         return np.tile(np.where(opaque, 1.0, through), (2, 1))
 
 
-def found_openings(ghost: ScriptedGhost, **settings) -> np.ndarray:
-    return find_openings(ghost, VERTICES, FACES, OpeningsConfig(**settings), 0.005, ghost.train) <= 0
+def found_openings(appearance: ScriptedRadiance, **settings) -> np.ndarray:
+    config = OpeningsConfig(**settings)
+    return find_openings(appearance, VERTICES, FACES, config, 0.005, appearance.train) <= 0
 
 
 @pytest.mark.parametrize(("false", "behind", "openings", "rounds"), [
@@ -57,23 +58,23 @@ def found_openings(ghost: ScriptedGhost, **settings) -> np.ndarray:
     (((0, 1, 0),), ((1, 0, 0), (-1, 0, 0)), 3, 2),
 ])
 def test_rounds_go_on_as_long_as_they_find_openings(false, behind, openings, rounds):
-    ghost = ScriptedGhost(((0, 0, 1), *false), false, behind)
-    opened = found_openings(ghost)
-    assert ghost.rounds == rounds
+    appearance = ScriptedRadiance(((0, 0, 1), *false), false, behind)
+    opened = found_openings(appearance)
+    assert appearance.rounds == rounds
     assert len(np.unique(equal_patches(opened, FACES)[opened])) == openings
-    assert opened[ghost.cap((0, 0, 1))].all(), "what was justified stays"
-    assert not opened[ghost.false].any()
+    assert opened[appearance.cap((0, 0, 1))].all(), "what was justified stays"
+    assert not opened[appearance.false].any()
 
 
 def test_false_openings_alone_are_reason_enough_for_another_round():
-    ghost = ScriptedGhost(((0, 1, 0),), ((0, 1, 0),), ((0, 0, 1),))
-    opened = found_openings(ghost)
-    np.testing.assert_array_equal(opened, ghost.cap((0, 0, 1)))
+    appearance = ScriptedRadiance(((0, 1, 0),), ((0, 1, 0),), ((0, 0, 1),))
+    opened = found_openings(appearance)
+    np.testing.assert_array_equal(opened, appearance.cap((0, 0, 1)))
 
 
 @pytest.mark.parametrize(("settings", "found"), [({"rounds": 0}, True), ({"gain": 0.0}, False)])
 def test_no_rounds_that_are_not_asked_for_or_can_find_nothing(settings, found):
-    ghost = ScriptedGhost(((0, 0, 1), (0, 1, 0)), ((0, 1, 0),), ((1, 0, 0),))
-    opened = found_openings(ghost, **settings)
-    assert ghost.rounds == 0
-    np.testing.assert_array_equal(opened, ghost.cap((0, 0, 1)) & found)
+    appearance = ScriptedRadiance(((0, 0, 1), (0, 1, 0)), ((0, 1, 0),), ((1, 0, 0),))
+    opened = found_openings(appearance, **settings)
+    assert appearance.rounds == 0
+    np.testing.assert_array_equal(opened, appearance.cap((0, 0, 1)) & found)

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from ...compat import mesh_scene
+from ..compat import mesh_scene
 
 
 def opposite_sides(before: np.ndarray, moved: np.ndarray, faces: np.ndarray,

@@ -12,10 +12,10 @@ import dataclasses
 import mitsuba as mi
 import numpy as np
 
-from ...extraction.surface_mesh import SurfaceMesh
-from ...fields import LatticeFields
-from ...topology import mesh_edges, spread
-from ..ghost.opening import rewritten
+from ..extraction.surface_mesh import SurfaceMesh
+from ..fields import LatticeFields
+from ..topology import mesh_edges, spread
+from .msdf import rewritten
 from .values_nearby import values_nearby
 
 #: Farthest way, in cells of the coarse lattice, between both templates.
@@ -25,7 +25,7 @@ _REACH = 0.5
 _AROUND = 2
 
 
-def recut(subject: mi.Shape, coarse: LatticeFields, fine: LatticeFields) -> LatticeFields:
+def transfer_msdf(subject: mi.Shape, coarse: LatticeFields, fine: LatticeFields) -> LatticeFields:
     """Fine fields that are open where the coarse ones are.
 
     Args:

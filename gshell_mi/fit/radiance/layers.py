@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..lanes import chosen_lanes
+from .lanes import chosen_lanes
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Sheet:
         return 2 * corner + dr.select(self.front, mi.UInt32(0), mi.UInt32(1))
 
 
-def trace_sheets(scene: mi.Scene, positions: mi.Float, faces: mi.Vector3u, ray: mi.Ray3f, count: int,
+def trace_layers(scene: mi.Scene, positions: mi.Float, faces: mi.Vector3u, ray: mi.Ray3f, count: int,
                  offset: float, goes_on: Callable[[Sheet], mi.Bool] | None = None) -> list[Sheet]:
     """The first sheets along each ray.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...triangles import area_vectors
-from .template_sides import cast, normals_at_vertices
+from ..triangles import area_vectors
+from .sides import cast, normals_at_vertices
 
 #: Nearest vertices among which one that faces the same way is looked for.
 _NEIGHBOURS = 8

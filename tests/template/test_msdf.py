@@ -9,13 +9,13 @@ from topology import assert_manifold, loop_count
 
 from gshell_mi.extraction import extract
 from gshell_mi.fields import sphere
-from gshell_mi.fit.ghost.opening import (
+from gshell_mi.lattice import TetLattice
+from gshell_mi.template.msdf import (
     clean_opacity,
     msdf_from_template,
     splat_to_lattice,
     without_specks,
 )
-from gshell_mi.lattice import TetLattice
 
 
 def test_small_cuts_and_islands_are_undone(ball):

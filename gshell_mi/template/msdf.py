@@ -1,4 +1,4 @@
-"""From the ghost's opacity to an mSDF: where the template is cut open."""
+"""From an opacity to an mSDF: where the template is cut open."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...extraction.surface_mesh import SurfaceMesh
-from ...fields.smoothing import LatticeDiffusion, MeshDiffusion
-from ...lattice import Lattice
-from ...topology import equal_patches, mesh_components
-from ...triangles import vertex_areas
+from ..extraction.surface_mesh import SurfaceMesh
+from ..fields.smoothing import LatticeDiffusion, MeshDiffusion
+from ..lattice import Lattice
+from ..topology import equal_patches, mesh_components
+from ..triangles import vertex_areas
 
 #: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
 _CERTAIN = 3.0

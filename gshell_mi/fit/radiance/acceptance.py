@@ -19,8 +19,8 @@ _SMALL, _STRICTER = 0.05, 0.725
 _CLOSINGS, _WORST = 5, 0.5
 
 
-def close_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.ndarray], np.ndarray],
-                      gain: float) -> np.ndarray:
+def close_rejected(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.ndarray], np.ndarray],
+                   gain: float) -> np.ndarray:
     """Closes the openings through which the images are not explained better than without them.
 
     A hull that bulges over a fold, or a highlight, makes the views disagree on a vertex's radiance as a
@@ -62,14 +62,14 @@ def close_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np
     return np.where((logits <= 0) & ~opened, -logits, logits)
 
 
-def open_unjustified(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.ndarray], np.ndarray],
-                     gain: float) -> np.ndarray:
+def open_rejected(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.ndarray], np.ndarray],
+                  gain: float) -> np.ndarray:
     """Opens the islands in openings without which the images are explained about as well.
 
     A highlight on the inside of a bowl may be explained by a piece of the lid.
 
     Args:
-        logits, faces, error: as of ``close_unjustified``.
+        logits, faces, error: as of ``close_rejected``.
         gain: an island stays if the error with it is less than this fraction of that without.
 
     Returns:

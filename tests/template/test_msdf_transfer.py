@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gshell_mi.fields import sphere
-from gshell_mi.fit.cut.recut import recut
 from gshell_mi.lattice import make_lattice
+from gshell_mi.template.msdf_transfer import transfer_msdf
 from gshell_mi.topology import topology
 
 COARSE, FINE = 20, 40
@@ -38,7 +38,7 @@ def test_a_slit_stays_whole(slit_ball, blocks):
     assert (before.boundary_loops, before.pinholes, before.components) == (1, 0, 1)
     fine = (coarse.in_blocks if blocks else coarse.to_lattice)(FINE)
     assert found(subject, fine).boundary_loops > 5, "interpolation alone cuts it up"
-    fields = recut(subject, coarse, fine)
+    fields = transfer_msdf(subject, coarse, fine)
     after = found(subject, fields)
     assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
     assert after.boundary_length == pytest.approx(before.boundary_length, rel=0.02)
@@ -52,4 +52,4 @@ def test_what_is_closed_stays_as_it_is(slit_ball):
     subject, coarse = slit_ball
     closed = replace(coarse, msdf=np.ones_like(coarse.msdf))
     fine = closed.to_lattice(FINE)
-    assert recut(subject, closed, fine) is fine
+    assert transfer_msdf(subject, closed, fine) is fine

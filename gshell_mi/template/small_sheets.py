@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from ...topology import mesh_components
+from ..topology import mesh_components
 
 
 def small_sheets(moved: np.ndarray, normals: np.ndarray, faces: np.ndarray, others: np.ndarray,

@@ -13,14 +13,14 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...conversion.solid_distance import solid_distance
-from ...fields import LatticeFields
-from ...fields.smoothing import MeshDiffusion
-from ...lattice import Lattice
-from ...topology import PINHOLE, Topology, boundary_edges, topology
-from ...triangles import positive_part
-from ..ghost.opening import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
-from .template_sides import normals_at_vertices, opposite_sides
+from ..conversion.solid_distance import solid_distance
+from ..fields import LatticeFields
+from ..fields.smoothing import MeshDiffusion
+from ..lattice import Lattice
+from ..topology import PINHOLE, Topology, boundary_edges, topology
+from ..triangles import positive_part
+from .msdf import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
+from .sides import normals_at_vertices, opposite_sides
 from .values_nearby import values_nearby
 
 #: The lattice holds what is this thick, in cells, whatever its direction ...
@@ -55,9 +55,9 @@ _RIM = 2.0
 _FRACTIONS = (1.0, 0.7, 0.4)
 
 
-def recast(subject: mi.Shape, lattice: Lattice, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray,
-           logits: np.ndarray, radiance: np.ndarray, min_area: float, wanted: Topology,
-           fewest_loops: int | None = None) -> dict[str, np.ndarray] | None:
+def revoxelise(subject: mi.Shape, lattice: Lattice, vertices: np.ndarray, moved: np.ndarray,
+               faces: np.ndarray, logits: np.ndarray, radiance: np.ndarray, min_area: float, wanted: Topology,
+               fewest_loops: int | None = None) -> dict[str, np.ndarray] | None:
     """Fields whose surface is the moved template's, with its openings.
 
     Args:

@@ -1,4 +1,4 @@
-"""The radiance ghost: which parts of a template are surface, found without a light model.
+"""A radiance on a surface: which parts of a template are surface, found without a light model.
 
 Every vertex of the watertight template carries an opacity and one radiance per side; a glossy lobe that all
 share adds what depends on the view. A pixel's ray
@@ -22,15 +22,15 @@ from ... import losses
 from ...activations import inverse_softplus, sigmoid, softplus
 from ...compat import mesh_scene, move_mesh
 from ...fields.smoothing import MeshDiffusion
+from ...template.normals import vertex_normals
 from ...views import PinholeViews
 from ..bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from .contrast import Contrast
-from .glossy_lobe import PER_SIDE, SHARED, initial_lobe, mirrored_radiance
-from .mesh_normals import vertex_normals
+from .gloss import PER_SIDE, SHARED, initial_lobe, mirrored_radiance
+from .layers import Sheet, trace_layers
 from .pixels import COVERED, PixelPool, PixelSample
-from .sheets import Sheet, trace_sheets
 
 #: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
 #: enough that all are seen; colours fitted at full opacity would bleed what is inside into the caps.
@@ -48,7 +48,7 @@ _LOGIT_LIMIT = 3.0
 #: Steps that adapt the radiance to a given opacity, and steps that then measure the image error.
 _REFIT_STEPS, _ERROR_STEPS = 40, 20
 
-#: Refits of a ghost that has not learnt anything yet.
+#: Refits of a radiance that has not learnt anything yet.
 _ROUNDS_FROM_GREY = 3
 
 #: Random pixels of these steps must not depend on how many training steps came before.
@@ -72,7 +72,7 @@ class RadianceConfig:
     """Lambda of the Sobolev gradient (I + lambda L)^-1 on the template."""
 
 
-class RadianceGhost:
+class SurfaceRadiance:
     """Opacity and two-sided radiance on a fixed mesh, trained on random pixels of all views.
 
     Args:
@@ -159,7 +159,7 @@ class RadianceGhost:
         return np.stack([total.numpy() for total in sums])
 
     def unexplained(self, pixels: PixelPool) -> float:
-        """Mean image loss on other pixels than those that the ghost was trained on."""
+        """Mean image loss on other pixels than those that it was trained on."""
         total = mi.Float(0)
         with dr.suspend_grad():
             for step in range(_ERROR_STEPS):
@@ -273,7 +273,7 @@ class RadianceGhost:
             dr.eval(transmittance)
             return transmittance > _NEGLIGIBLE
 
-        return trace_sheets(self.scene, self._positions, self._faces, ray, self.config.layers,
+        return trace_layers(self.scene, self._positions, self._faces, ray, self.config.layers,
                             self._offset, goes_on if self._opacity_rests else None)
 
     def composite(self, sheets: list[Sheet], count: int) -> tuple[mi.Color3f, mi.Float]:

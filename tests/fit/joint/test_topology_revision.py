@@ -11,11 +11,11 @@ from cap import cap
 
 from gshell_mi.fields import sphere
 from gshell_mi.fit import FitConfig
-from gshell_mi.fit.ghost.opening import without_specks
-from gshell_mi.fit.joint import second_look
-from gshell_mi.fit.joint.second_look import SecondLook, doubtful
-from gshell_mi.fit.joint.seen_through import Explained
+from gshell_mi.fit.joint import topology_revision
+from gshell_mi.fit.joint.residuals import Residuals
+from gshell_mi.fit.joint.topology_revision import TopologyRevision, doubtful
 from gshell_mi.lattice import TetLattice
+from gshell_mi.template.msdf import without_specks
 from gshell_mi.topology import topology
 
 LATTICE, RADIUS = TetLattice(20), 0.6
@@ -26,11 +26,11 @@ LATTICE, RADIUS = TetLattice(20), 0.6
 
 @pytest.mark.parametrize(("share", "error", "rays", "doubted"), [
     (0.03, 2.0, 50.0, True), (0.1, 2.0, 50.0, False), (0.03, 1.0, 50.0, False), (0.03, 2.0, 0.1, False)],
-    ids=["small", "large", "explained not much worse", "hardly seen"])
+                         ids=["small", "large", "explained not much worse", "hardly seen"])
 def test_small_openings_that_show_what_no_image_does_are_doubtful(ball, share, error, rays, doubted):
     up, down = cap(ball, [0, 0, 1], share), cap(ball, [0, 0, -1], 0.03)
     seen = np.where(up, rays, 50.0)
-    found = Explained(seen, seen * np.where(up, error, np.where(down, 0.6, 0.1)), seen)
+    found = Residuals(seen, seen * np.where(up, error, np.where(down, 0.6, 0.1)), seen)
     result = doubtful(np.where(up | down, -1.0, 1.0), ball.vertices, ball.faces, found)
     np.testing.assert_array_equal(result, up & doubted)
 
@@ -39,7 +39,7 @@ def test_openings_through_which_nothing_is_seen_are_doubtful(ball):
     """Where pixels are covered: however badly the surface is explained, there is nothing that could be."""
     up, down = cap(ball, [0, 0, 1], 0.03), cap(ball, [0, 0, -1], 0.03)
     rays = np.full(len(up), 50.0)
-    found = Explained(rays, rays * np.where(up, 4.0, np.where(down, 2.0, 0.5)), rays)
+    found = Residuals(rays, rays * np.where(up, 4.0, np.where(down, 2.0, 0.5)), rays)
     result = doubtful(np.where(up | down, -1.0, 1.0), ball.vertices, ball.faces, found)
     np.testing.assert_array_equal(result, up)
 
@@ -108,17 +108,17 @@ def evidence_above(monkeypatch):
         empty, side = z > 0.2, x > 0.5
         rays, later = np.full(len(z), 50.0), said["later"] if seed else 1.0
         now = np.where(empty, said["empty"] * later, np.where(side, said["doubtful"] * later, 0.1))
-        return Explained(rays, rays * now, rays * np.where(empty, 0.6, 4.0))
+        return Residuals(rays, rays * now, rays * np.where(empty, 0.6, 4.0))
 
-    monkeypatch.setattr(second_look, "explained", fake)
+    monkeypatch.setattr(topology_revision, "residuals_of", fake)
     return said
 
 
 CONFIG = FitConfig(iterations=8).changed({"joint.revision": 0.0, "joint.revision_gain": 0.9})
 
 
-def run(joint: StillJoint, steps: range, state: dict | None = None) -> SecondLook:
-    worker = SecondLook(joint, None, None, state or {})
+def run(joint: StillJoint, steps: range, state: dict | None = None) -> TopologyRevision:
+    worker = TopologyRevision(joint, None, None, state or {})
     for iteration in steps:
         worker.step(iteration)
     return worker
@@ -205,7 +205,7 @@ def test_growth_that_is_not_to_blame_for_other_loops_stays(evidence_above):
     assert joint.loops() == 2 and joint.height() == pytest.approx(0.2, abs=1.5 * LATTICE.spacing)
 
 
-def met_openings(gone_below: bool) -> tuple[StillJoint, SecondLook]:
+def met_openings(gone_below: bool) -> tuple[StillJoint, TopologyRevision]:
     """Of two openings one grows, and later a strip between them goes, and more; before the end a third one,
     at the other end, may go."""
     joint, (x, _, z) = StillJoint(CONFIG), LATTICE.vertex_positions().T
@@ -291,7 +291,7 @@ def ball_and_disc(thickness: float, msdf: float, place: float = 0.65) -> StillJo
 def test_a_sheet_that_comes_back_has_one_side(evidence_above, monkeypatch, thickness, later, components,
                                               loops):
     """The disc has been cut away."""
-    monkeypatch.setattr(second_look, "_SMALL", 0.8)     # as a lattice this coarse needs
+    monkeypatch.setattr(topology_revision, "_SMALL", 0.8)     # as a lattice this coarse needs
     evidence_above |= {"later": later, "doubtful": 20.0, "empty": 0.1}
     joint = ball_and_disc(thickness, -0.05)
     assert joint.loops() == 1
@@ -305,7 +305,7 @@ def test_a_sheet_that_comes_back_has_one_side(evidence_above, monkeypatch, thick
 @pytest.mark.parametrize(("thickness", "loops", "grows"), [(1.2, 2, False), (1.2, 2, True), (4.0, 1, False)])
 def test_a_loose_sheet_has_one_side(evidence_above, monkeypatch, thickness, loops, grows):
     """The disc has both. Whether there is anything else to change is of no account."""
-    monkeypatch.setattr(second_look, "_SMALL", 0.8)
+    monkeypatch.setattr(topology_revision, "_SMALL", 0.8)
     evidence_above |= {"later": 0.5, "empty": 0.4 if grows else 0.1}
     joint = ball_and_disc(thickness, 0.05)
     assert joint.loops() == 1
@@ -318,7 +318,7 @@ def test_a_loose_sheet_has_one_side(evidence_above, monkeypatch, thickness, loop
 @pytest.mark.parametrize("thickness", [0.6, 1.0])
 def test_the_side_of_a_thin_sheet_that_stays_is_whole(evidence_above, monkeypatch, thickness):
     """Both sides hang on one layer of the lattice's vertices; the mSDF is small, as after many steps."""
-    monkeypatch.setattr(second_look, "_SMALL", 0.8)
+    monkeypatch.setattr(topology_revision, "_SMALL", 0.8)
     evidence_above |= {"empty": 0.1}
     joint = ball_and_disc(thickness, 0.1 * LATTICE.spacing, place=0.7)
     run(joint, range(8)).finish()
@@ -331,7 +331,7 @@ def test_the_side_of_a_thin_sheet_that_stays_is_whole(evidence_above, monkeypatc
 @pytest.mark.parametrize("neck", [False, True])
 def test_a_loose_sheet_that_closes_opens_in_the_end(evidence_above, monkeypatch, neck):
     """But for a speck, which is noise, or for where the template goes on from its edge."""
-    monkeypatch.setattr(second_look, "_SMALL", 0.8)
+    monkeypatch.setattr(topology_revision, "_SMALL", 0.8)
     evidence_above |= {"empty": 0.1}
     joint, cell = ball_and_disc(1.2, 0.05), LATTICE.spacing
     x, y, z = LATTICE.vertex_positions().T
@@ -354,7 +354,7 @@ def test_a_loose_sheet_that_closes_opens_in_the_end(evidence_above, monkeypatch,
     assert found.boundary_length > 1.3 * 2 * np.pi * RADIUS
 
 
-@pytest.mark.parametrize("settings", [{"second_look": 1.0}, {"watertight": True}, {"field": "hashgrid"},
+@pytest.mark.parametrize("settings", [{"topology_revision": 1.0}, {"watertight": True}, {"field": "hashgrid"},
                                       {"iterations": 1}])
 def test_modes_without_it(evidence_above, settings):
     joint = StillJoint(replace(CONFIG, **settings))

@@ -10,7 +10,7 @@ from ..bookkeeping.observer import Preview
 from ..stage import Work
 
 
-class Descent:
+class EarlyStopping:
     """A worker whose image loss at the first steps is compared with that at a quarter of them.
 
     Each step looks at pixels of its own, so an eighth of the steps up to there are averaged at either end.

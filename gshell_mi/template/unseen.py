@@ -5,12 +5,12 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from ...fields import LatticeFields
-from ...fields.smoothing import MeshDiffusion
-from ...triangles import area_vectors, unit
-from ...views import PinholeViews
-from ...visibility import best_view
-from ..ghost.opening import clean_opacity, reopened, rewritten
+from ..fields import LatticeFields
+from ..fields.smoothing import MeshDiffusion
+from ..triangles import area_vectors, unit
+from ..views import PinholeViews
+from ..visibility import best_view
+from .msdf import clean_opacity, reopened, rewritten
 
 #: What is seen at this cosine or less is as good as unseen: a hull ends in surfaces that views only graze.
 _GRAZING = 0.2

@@ -8,11 +8,11 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...extraction.surface_mesh import SurfaceMesh
-from ...fields import LatticeFields
-from ...fields.thin_parts import back_on_solid
-from ...lattice import Lattice
-from ..surface import Surface
+from ..extraction.surface_mesh import SurfaceMesh
+from ..fields import LatticeFields
+from ..fields.thin_parts import back_on_solid
+from ..lattice import Lattice
+from .surface import Surface
 
 #: A template takes its opacity from another one that is at most this many cells away ...
 _REACH = 1.5
@@ -22,7 +22,7 @@ _CERTAIN = 3.0
 
 
 @dataclass(frozen=True)
-class GhostTemplate:
+class Template:
     """A watertight mesh with an opacity.
 
     Attributes:
@@ -59,8 +59,8 @@ def closed_template(subject: mi.Shape, sdf: np.ndarray,
     return mesh, vertices, faces
 
 
-def ghost_template(subject: mi.Shape, surface: Surface, *,
-                   like: GhostTemplate | None = None) -> GhostTemplate:
+def template_of(subject: mi.Shape, surface: Surface, *,
+                like: Template | None = None) -> Template:
     """Extracts a template from lattice fields.
 
     Args:
@@ -77,4 +77,4 @@ def ghost_template(subject: mi.Shape, surface: Surface, *,
         near = distance < _REACH * lattice.spacing * subject.length_scale
         logits = np.where(near, like.logits[nearest], _CERTAIN)
     start = back_on_solid(vertices, faces, np.where(logits > 0, subject.length_scale * excess, 0))
-    return GhostTemplate(mesh, vertices, faces, logits, start)
+    return Template(mesh, vertices, faces, logits, start)

@@ -5,9 +5,9 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from gshell_mi.fit.ghost.glossy_lobe import _HEIGHT, _NODES, initial_lobe, mirrored_radiance
-from gshell_mi.fit.ghost.pixels import PixelPool
-from gshell_mi.fit.ghost.radiance_ghost import RadianceConfig, RadianceGhost
+from gshell_mi.fit.radiance.gloss import _HEIGHT, _NODES, initial_lobe, mirrored_radiance
+from gshell_mi.fit.radiance.pixels import PixelPool
+from gshell_mi.fit.radiance.surface_radiance import RadianceConfig, SurfaceRadiance
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement
 from gshell_mi.fit.stages.refinement import RefinementConfig
 from gshell_mi.targets import Target
@@ -94,10 +94,10 @@ def test_highlights_pull_the_surface_inwards_far_less():
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     offsets = {}
     for glossy in (False, True):
-        ghost = RadianceGhost(vertices, faces, views, pixels, RADIANCE, glossy=glossy)
+        appearance = SurfaceRadiance(vertices, faces, views, pixels, RADIANCE, glossy=glossy)
         for _ in range(3):
-            ghost.refit(np.ones(len(vertices), bool))
-        refinement = PhotometricRefinement(ghost, vertices, faces, None, CELL, CONFIG)
+            appearance.refit(np.ones(len(vertices), bool))
+        refinement = PhotometricRefinement(appearance, vertices, faces, None, CELL, CONFIG)
         for step in range(CONFIG.iterations):
             refinement.step(step)
         offsets[glossy] = (np.linalg.norm(refinement.positions(), axis=1) - RADIUS).mean() / CELL

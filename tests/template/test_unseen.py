@@ -6,8 +6,8 @@ import pytest
 from topology import boundary_edges
 
 from gshell_mi.fields import sphere
-from gshell_mi.fit.cut.unseen import without_unseen
 from gshell_mi.lattice import TetLattice
+from gshell_mi.template.unseen import without_unseen
 from gshell_mi.topology import topology
 from gshell_mi.views import PinholeViews
 

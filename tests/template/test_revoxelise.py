@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from gshell_mi.fields import LatticeFields
-from gshell_mi.fit.cut.recast import is_torn, recast, thickened
+from gshell_mi.template.revoxelise import is_torn, revoxelise, thickened
 from gshell_mi.topology import Topology, topology
 from gshell_mi.triangles import positive_part
 
@@ -46,9 +46,9 @@ def test_a_sphere_that_grew(mirror):
     subject, vertices, faces = sphere(mi.ScalarTransform4f().translate([5, 0, 0]).scale(scale))
     centre = np.array([5.0, 0, 0])
     moved = centre + 1.2 * (vertices - centre)
-    fields = recast(subject, subject.lattice, vertices, moved, faces, solid(vertices),
-                    np.abs(vertices - centre), 0.005,
-                    counts(0))
+    fields = revoxelise(subject, subject.lattice, vertices, moved, faces, solid(vertices),
+                        np.abs(vertices - centre), 0.005,
+                        counts(0))
     found = surface(subject, fields)
     radius = np.linalg.norm(found.vertices - centre, axis=1)
     np.testing.assert_allclose(radius, 1.44, atol=0.08 * 2 * CELL)
@@ -63,9 +63,9 @@ def test_a_sphere_that_grew(mirror):
 def test_the_opening_moves_along():
     subject, vertices, faces = sphere()
     logits = (0.2 - vertices[:, 1]) / CELL
-    fields = recast(subject, subject.lattice, vertices, vertices * [1, 1.25, 1], faces, logits,
-                    np.ones((len(vertices), 3)),
-                    0.005, counts(1))
+    fields = revoxelise(subject, subject.lattice, vertices, vertices * [1, 1.25, 1], faces, logits,
+                        np.ones((len(vertices), 3)),
+                        0.005, counts(1))
     found = surface(subject, fields)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
@@ -83,8 +83,8 @@ def test_a_sheet_stays_whole_and_in_its_place():
     vertices[:, 2] += top - CELL / 6
     logits = np.where(vertices[:, 2] > top - 0.1 * CELL, 0.5 - np.hypot(*vertices[:, :2].T), -1) / CELL
     subject, *_ = sphere()
-    fields = recast(subject, subject.lattice, vertices, vertices, faces, logits, np.ones((len(vertices),
-                    3)), 0.005, counts(1))
+    fields = revoxelise(subject, subject.lattice, vertices, vertices, faces, logits,
+                        np.ones((len(vertices), 3)), 0.005, counts(1))
     found = surface(subject, fields)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
@@ -96,8 +96,8 @@ def test_a_sheet_stays_whole_and_in_its_place():
 
 def test_a_collapse_goes_only_as_far_as_the_surface_lasts():
     subject, vertices, faces = sphere()
-    fields = recast(subject, subject.lattice, vertices, np.zeros_like(vertices), faces, solid(vertices),
-                    np.ones((len(vertices), 3)), 0.005, counts(0))
+    fields = revoxelise(subject, subject.lattice, vertices, np.zeros_like(vertices), faces, solid(vertices),
+                        np.ones((len(vertices), 3)), 0.005, counts(0))
     radius = np.linalg.norm(surface(subject, fields).vertices, axis=1)
     np.testing.assert_allclose(radius, 0.3 * 0.6, atol=0.1 * CELL)
 
@@ -145,8 +145,8 @@ def test_a_slit_that_closes_becomes_a_bridge():
     moved[:, 0], moved[:, 1] = radius * np.cos(closed), radius * np.sin(closed) * np.sign(angle)
     cut = topology(*positive_part(vertices, faces, logits))
     assert cut.boundary_loops == 1
-    fields = recast(subject, subject.lattice, vertices, moved, faces, logits, np.ones((len(vertices), 3)),
-                    0.005, cut)
+    fields = revoxelise(subject, subject.lattice, vertices, moved, faces, logits, np.ones((len(vertices), 3)),
+                        0.005, cut)
     found = surface(subject, fields)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (2, 0, 1)

@@ -16,8 +16,8 @@ import numpy as np
 from ...compat import mesh_scene
 from ...extraction.surface_mesh import SurfaceMesh
 from ...views import PinholeViews
-from ..ghost.pixels import COVERED, PixelPool
-from ..lanes import chosen_lanes
+from ..radiance.lanes import chosen_lanes
+from ..radiance.pixels import COVERED, PixelPool
 
 #: Pixels per batch, and batches.
 _BATCH, _BATCHES = 65536, 24
@@ -37,7 +37,7 @@ _OFFSET = 1e-4
 
 
 @dataclass(frozen=True)
-class Explained:
+class Residuals:
     """Sums over random rays, by the vertices of the template where they meet it first.
 
     Attributes:
@@ -53,8 +53,8 @@ class Explained:
     without: np.ndarray
 
 
-def explained(template: SurfaceMesh, scene: mi.Scene, integrator, views: PinholeViews, pixels: PixelPool,
-              seed: int, *, behind: bool = True) -> Explained:
+def residuals_of(template: SurfaceMesh, scene: mi.Scene, integrator, views: PinholeViews, pixels: PixelPool,
+                 seed: int, *, behind: bool = True) -> Residuals:
     """Compares a scene, with and without its template, with the targets' wholly covered pixels.
 
     Args:
@@ -96,7 +96,7 @@ def explained(template: SurfaceMesh, scene: mi.Scene, integrator, views: Pinhole
                 for weight, vertex in zip(weights, face, strict=True):
                     dr.scatter_reduce(dr.ReduceOp.Add, total, weight * values, vertex)
             dr.eval(sums)
-        return Explained(*(total.numpy() for total in sums))
+        return Residuals(*(total.numpy() for total in sums))
 
 
 def _squared_error(scene: mi.Scene, integrator, sampler: mi.Sampler, ray: mi.Ray3f, target: mi.Color3f,

@@ -1,4 +1,4 @@
-"""The ghost's compositing in closed form, and its verdict on true and false openings."""
+"""Compositing of layers in closed form, and its verdict on true and false openings."""
 
 import dataclasses
 
@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from bowl import RADIUS, half_sphere
 
-from gshell_mi.fit.ghost.pixels import PixelPool
-from gshell_mi.fit.ghost.radiance_ghost import RadianceConfig, RadianceGhost
+from gshell_mi.fit.radiance.pixels import PixelPool
+from gshell_mi.fit.radiance.surface_radiance import RadianceConfig, SurfaceRadiance
 from gshell_mi.fit.stages.openings import OpacityTraining, OpeningsConfig
 from gshell_mi.scene import load_fit_scene
 from gshell_mi.targets import Target
@@ -46,22 +46,22 @@ def unused_views():
 
 
 @pytest.fixture(scope="module")
-def sheets() -> RadianceGhost:
+def sheets() -> SurfaceRadiance:
     """Opacities 0.3 and 0.6, constant radiance of each side of each sheet."""
-    ghost = RadianceGhost(*two_sheets(), *unused_views(), CONFIG)
-    ghost.optimizer["opacity"] = mi.Float(np.repeat(logit(np.array([0.3, 0.6])), 4))
+    appearance = SurfaceRadiance(*two_sheets(), *unused_views(), CONFIG)
+    appearance.optimizer["opacity"] = mi.Float(np.repeat(logit(np.array([0.3, 0.6])), 4))
     both_sides = np.stack([FRONT, BACK], axis=1)
-    ghost.optimizer["radiance"] = mi.Float(np.repeat(inverse_softplus(both_sides), 4, axis=0).ravel())
-    return ghost
+    appearance.optimizer["radiance"] = mi.Float(np.repeat(inverse_softplus(both_sides), 4, axis=0).ravel())
+    return appearance
 
 
 FRONT = np.array([[1.0, 0.5, 0.2], [0.1, 2.0, 0.4]])
 BACK = np.array([[0.3, 0.3, 3.0], [0.7, 0.2, 0.6]])
 
 
-def composite(ghost, origin, direction):
+def composite(appearance, origin, direction):
     ray = mi.Ray3f(origin, direction)
-    radiance, alpha = ghost.see(ray)
+    radiance, alpha = appearance.see(ray)
     return np.ravel(radiance), np.ravel(alpha)[0]
 
 
@@ -90,15 +90,15 @@ def test_a_miss_is_transparent(sheets):
 
 def test_what_no_ray_meets_keeps_its_radiance():
     vertices, faces = two_sheets()
-    ghost = RadianceGhost(vertices - [0, 0, 5], faces, *unused_views(), CONFIG)
-    before = ghost.radiance()
-    ghost.refit(np.ones(len(vertices), bool))
-    np.testing.assert_array_equal(ghost.radiance(), before)
+    appearance = SurfaceRadiance(vertices - [0, 0, 5], faces, *unused_views(), CONFIG)
+    before = appearance.radiance()
+    appearance.refit(np.ones(len(vertices), bool))
+    np.testing.assert_array_equal(appearance.radiance(), before)
 
 
 def test_only_the_first_sheets_count():
-    ghost = RadianceGhost(*two_sheets(), *unused_views(), dataclasses.replace(CONFIG, layers=1))
-    _, alpha = composite(ghost, [0.1, 0.2, 5], [0, 0, -1])
+    appearance = SurfaceRadiance(*two_sheets(), *unused_views(), dataclasses.replace(CONFIG, layers=1))
+    _, alpha = composite(appearance, [0.1, 0.2, 5], [0, 0, -1])
     assert alpha == pytest.approx(0.35, abs=1e-5), "where every vertex starts"
 
 
@@ -146,36 +146,36 @@ def bowl(bowl_scene):
     fit = load_fit_scene(bowl_scene)
     views = PinholeViews.from_sensors(fit.sensors)
     vertices, faces, lid = lidded_bowl()
-    ghost = RadianceGhost(vertices, faces, views, PixelPool(views, fit.targets), CONFIG)
-    return ghost, vertices, lid
+    appearance = SurfaceRadiance(vertices, faces, views, PixelPool(views, fit.targets), CONFIG)
+    return appearance, vertices, lid
 
 
 def test_a_true_opening_lowers_the_error_and_a_false_one_raises_it(bowl):
-    ghost, vertices, lid = bowl
+    appearance, vertices, lid = bowl
     bottom = vertices[:, 1] < -0.85 * RADIUS
-    closed = ghost.image_error(np.ones(len(vertices), bool))
-    truth = ghost.image_error(~lid)
+    closed = appearance.image_error(np.ones(len(vertices), bool))
+    truth = appearance.image_error(~lid)
     assert (truth[:, lid].sum(axis=1) < 0.7 * closed[:, lid].sum(axis=1)).all()
-    wrong = ghost.image_error(~lid & ~bottom)
+    wrong = appearance.image_error(~lid & ~bottom)
     assert (wrong[:, bottom].sum(axis=1) > 2 * truth[:, bottom].sum(axis=1)).all()
 
 
 def test_the_same_question_has_the_same_answer(bowl):
     """Also after others have been asked: it starts from an adapted radiance, but sees the same rays."""
-    ghost, _, lid = bowl
-    first = ghost.image_error(~lid)[:, lid].sum()
-    assert ghost.image_error(~lid)[:, lid].sum() == pytest.approx(first, rel=0.1)
+    appearance, _, lid = bowl
+    first = appearance.image_error(~lid)[:, lid].sum()
+    assert appearance.image_error(~lid)[:, lid].sum() == pytest.approx(first, rel=0.1)
 
 
 def test_training_tells_the_lid_from_the_bowl(bowl_scene):
     fit = load_fit_scene(bowl_scene)
     views = PinholeViews.from_sensors(fit.sensors)
     vertices, faces, lid = lidded_bowl()
-    ghost = RadianceGhost(vertices, faces, views, PixelPool(views, fit.targets), CONFIG)
-    training = OpacityTraining(ghost, TRAINING)
+    appearance = SurfaceRadiance(vertices, faces, views, PixelPool(views, fit.targets), CONFIG)
+    training = OpacityTraining(appearance, TRAINING)
     losses = [training.step(i)["image"] for i in range(TRAINING.iterations)]
     assert np.mean(losses[-10:]) < 0.65 * np.mean(losses[:10])
-    logits = ghost.smoothed_logits()
+    logits = appearance.smoothed_logits()
     inner = lid & (np.linalg.norm(vertices, axis=1) < 0.7 * RADIUS)
     assert (logits[inner] < 0).all()
     assert np.median(logits[inner]) < np.median(logits[~lid]) - 0.3

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from ...fields.smoothing import MeshDiffusion
-from ...topology import Topology, mesh_edges, patch_sizes, topology, vertex_components
-from ...triangles import positive_part
-from ..ghost.opening import clean_opacity, reopened
+from ..fields.smoothing import MeshDiffusion
+from ..topology import Topology, mesh_edges, patch_sizes, topology, vertex_components
+from ..triangles import positive_part
+from .msdf import clean_opacity, reopened
+from .sides import normals_at_vertices, opposite_sides
 from .small_sheets import small_sheets
-from .template_sides import normals_at_vertices, opposite_sides
 
 #: Parts are thin up to this thickness, in cells.
 _THIN = 1.2
@@ -66,8 +66,8 @@ class Cut:
     fewest_loops: int
 
 
-def without_spare_sides(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: float,
-                        sheet_thickness: float, min_area: float) -> Cut | None:
+def collapsed_sheets(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: float,
+                     sheet_thickness: float, min_area: float) -> Cut | None:
     """A moved template without the sides that it can do without; None if there are none, or it would fall
     apart.
 

@@ -6,9 +6,9 @@ import pytest
 
 from gshell_mi import TetLattice, extract
 from gshell_mi.fields import LatticeFields
-from gshell_mi.fit.cut.recast import recast
-from gshell_mi.fit.cut.spare_sides import Cut, without_spare_sides
-from gshell_mi.fit.cut.template_sides import opposite_sides
+from gshell_mi.template.revoxelise import revoxelise
+from gshell_mi.template.sides import opposite_sides
+from gshell_mi.template.thin_sheets import Cut, collapsed_sheets
 from gshell_mi.topology import topology
 from gshell_mi.triangles import positive_part
 
@@ -43,8 +43,8 @@ def flattened(vertices: np.ndarray, thickness: float) -> np.ndarray:
 
 def cut(vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> Cut | None:
     found = topology(vertices, faces[solid[faces].all(axis=1)])
-    return without_spare_sides(Cut(np.where(solid, 3.0, -3.0), moved, found, found.boundary_loops), vertices,
-                               faces, CELL, 0.5, 0.005)
+    return collapsed_sheets(Cut(np.where(solid, 3.0, -3.0), moved, found, found.boundary_loops), vertices,
+                            faces, CELL, 0.5, 0.005)
 
 
 @pytest.mark.parametrize("thickness", [0.2, -0.2])
@@ -59,9 +59,9 @@ def test_of_a_sheet_one_side_is_left(thickness):
     assert found.topology.boundary_loops == 1
 
     subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
-    fields = recast(subject, subject.lattice, vertices, found.positions, faces, found.logits,
-                    np.ones((len(vertices), 3)),
-                    0.005, found.topology, found.fewest_loops)
+    fields = revoxelise(subject, subject.lattice, vertices, found.positions, faces, found.logits,
+                        np.ones((len(vertices), 3)),
+                        0.005, found.topology, found.fewest_loops)
     closed = LatticeFields.closed(fields["sdf"])
     subject.set_fields(LatticeFields(closed.sdf, fields["msdf"], closed.deform))
     surface, surface_faces, _ = subject.surface.to_numpy()

@@ -1,6 +1,6 @@
 """Openings get a second look once light and material are known.
 
-The ghost finds openings before anything is known of the light. A cap that lies right behind a rim, such as at
+Openings are found before anything is known of the light. A cap that lies right behind a rim, such as at
 the end of a garment's pleat, it may leave: the radiance that it fits to a cap explains the few views that see
 in as well as the one that it fits to the dark inside. A path tracer knows how dark that is. So it is asked
 what would be seen without the surface beside an opening. Where that is about as good without anything having
@@ -23,16 +23,16 @@ from scipy.spatial import cKDTree
 
 from ...extraction.surface_mesh import SurfaceMesh
 from ...fields.smoothing import MeshDiffusion
+from ...template.msdf import clean_opacity, reopened, rewritten
+from ...template.small_sheets import small_sheets
 from ...topology import boundary_edges, equal_patches, mesh_components, mesh_edges, spread, topology
 from ...triangles import positive_part, vertex_areas
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
-from ..cut.small_sheets import small_sheets
-from ..ghost.opening import clean_opacity, reopened, rewritten
-from ..ghost.pixels import PixelPool
+from ..radiance.pixels import PixelPool
 from .growth import grown, joined, near_openings
 from .joint import JointStage
-from .seen_through import Explained, explained
+from .residuals import Residuals, residuals_of
 
 #: Lambda that smooths errors along the template, and new rims.
 _SMOOTHING = 3.0
@@ -70,7 +70,7 @@ _SHEET = 1.5
 _NEAR = 1.5
 
 
-class SecondLook:
+class TopologyRevision:
     """A worker that reconsiders the openings of the joint stage between its steps.
 
     Args:
@@ -328,9 +328,9 @@ class SecondLook:
         vertices, faces, _ = template.to_numpy()
         return template, vertices, faces, template.interpolate(dr.detach(self.joint.subject.msdf)).numpy()
 
-    def _explained(self, template: SurfaceMesh, iteration: int, *, behind: bool = True) -> Explained:
-        return explained(template, self.joint.scene, self.joint.integrator, self._views, self._pixels,
-                         self.joint.seed(iteration), behind=behind)
+    def _explained(self, template: SurfaceMesh, iteration: int, *, behind: bool = True) -> Residuals:
+        return residuals_of(template, self.joint.scene, self.joint.integrator, self._views, self._pixels,
+                            self.joint.seed(iteration), behind=behind)
 
     def _write(self, template: SurfaceMesh, values: np.ndarray | float, changed: np.ndarray) -> mi.Float:
         """Gives the mSDF new values, (V,) or one, at those vertices of the template that are chosen (V,)."""
@@ -340,7 +340,7 @@ class SecondLook:
         return msdf
 
 
-def doubtful(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found: Explained) -> np.ndarray:
+def doubtful(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found: Residuals) -> np.ndarray:
     """(V,) small openings through which the images are explained much worse than by the surface.
 
     Args:
@@ -362,7 +362,7 @@ def _loops(vertices: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> tuple[
     return found.boundary_loops, found.pinholes
 
 
-def _errors(found: Explained, patch: np.ndarray, solid: np.ndarray, count: int | None = None) -> np.ndarray:
+def _errors(found: Residuals, patch: np.ndarray, solid: np.ndarray, count: int | None = None) -> np.ndarray:
     """(P + 1,) mean squared errors of the patches and of the remaining surface.
 
     Args:

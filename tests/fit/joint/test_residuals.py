@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gshell_mi.fields import LatticeFields
-from gshell_mi.fit.ghost.pixels import PixelPool
-from gshell_mi.fit.joint.seen_through import explained
+from gshell_mi.fit.joint.residuals import residuals_of
+from gshell_mi.fit.radiance.pixels import PixelPool
 from gshell_mi.lattice import TetLattice
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
@@ -36,7 +36,7 @@ def test_what_is_left_of_a_lid_is_explained_by_what_is_behind_it():
         "type": "perspective", "fov": 30, "film": {"type": "hdrfilm", "width": 48, "height": 48,
                                                    "pixel_format": "rgba", "rfilter": {"type": "box"}},
         "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 0, 1])})
-        for origin in ([0.5, 3, 0.5], [0.5, -3, 0.5])]
+               for origin in ([0.5, 3, 0.5], [0.5, -3, 0.5])]
     integrator = mi.load_dict({"type": "gshell_path", "max_depth": 4, "hide_emitters": True})
 
     def show(fields):
@@ -48,8 +48,8 @@ def test_what_is_left_of_a_lid_is_explained_by_what_is_behind_it():
     targets = [Target(Path(), np.array(image), True) for image in images]
     show(half_ball(0.22))
     views, template = PinholeViews.from_sensors(sensors), subject.template()
-    found = explained(template, scene, integrator, views, PixelPool(views, targets), seed=1)
-    once = explained(template, scene, integrator, views, PixelPool(views, targets), seed=1, behind=False)
+    found = residuals_of(template, scene, integrator, views, PixelPool(views, targets), seed=1)
+    once = residuals_of(template, scene, integrator, views, PixelPool(views, targets), seed=1, behind=False)
     np.testing.assert_array_equal(once.without, 0)
     assert once.now.sum() == pytest.approx(found.now.sum(), rel=0.02)
     x, y, z = template.to_numpy()[0].T

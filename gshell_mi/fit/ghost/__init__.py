@@ -1,1 +1,0 @@
-"""Radiance without light or material: finds the openings of the hull."""
