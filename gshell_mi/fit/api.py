@@ -16,13 +16,13 @@ from ..export import FitFolder, export_fit, write_metrics
 from ..export.asset import write_asset
 from ..interrupt import Interrupt
 from ..memory import GIB, free_memory_of_variant, peak_memory
+from ..progress import Progress
 from ..report import write_report
 from ..scene import load_fit_scene
 from ..scene_inputs import scene_inputs
 from .bookkeeping.checkpoint import Checkpoint
 from .bookkeeping.fingerprint import check_fingerprint, fingerprint
 from .bookkeeping.observer import Observer
-from .bookkeeping.progress import Progress
 from .config import FitConfig, default_output
 from .fitted import Fitted
 from .joint.depth import check_depth

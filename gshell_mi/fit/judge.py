@@ -12,9 +12,9 @@ import numpy as np
 from .. import losses
 from ..compat import mesh_scene
 from ..fields.smoothing import MeshDiffusion
+from ..pixels import COVERED, PixelPool
 from ..targets import Target
 from ..views import PinholeViews
-from .radiance.pixels import COVERED, PixelPool
 
 if TYPE_CHECKING:
     from .config import FitConfig

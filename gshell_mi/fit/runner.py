@@ -15,9 +15,9 @@ import numpy as np
 from ..errors import UserError
 from ..files import replacing
 from ..interrupt import Interrupt
+from ..progress import Progress
 from .bookkeeping.checkpoint import DONE, Checkpoint, optimizer_arrays, restore_optimizer
 from .bookkeeping.observer import Observer
-from .bookkeeping.progress import Progress
 from .stage import Fit, Stage, Work
 from .surface import Surface
 
@@ -68,7 +68,7 @@ class Runner:
         self._rewind_log(names)
         for stage, following in zip(stages, names[1:], strict=True):
             if stage.name == checkpoint.stage:
-                surface = stage.run(fit, surface, RunnerSteps(self, stage.name, surface))
+                surface = stage.run(fit, surface, Steps(self, stage.name, surface))
                 checkpoint.stage, checkpoint.iteration, checkpoint.arrays = following, 0, surface.to_arrays()
                 self.save()
         return surface
@@ -113,13 +113,17 @@ class Runner:
             partial.write_bytes(b"".join(kept))
 
 
-class RunnerSteps:
-    """What the runner does for one stage: see ``stage.Steps``.
+class Steps:
+    """What a stage may ask of the runner.
 
     Args:
         runner: whose checkpoint is in that stage.
         stage: its name.
         surface: that it is given.
+
+    Attributes:
+        done: steps that a run before has done; 0 of a stage that begins.
+        kept: what ``state`` gave then; empty of a stage that begins.
     """
 
     def __init__(self, runner: Runner, stage: str, surface: Surface):
@@ -130,7 +134,16 @@ class RunnerSteps:
     def run(self, work: Work, count: int, optimizers: Mapping[str, mi.ad.Adam],
             state: Callable[[], dict[str, np.ndarray]] = dict,
             stalled: Callable[[int], bool] = lambda done: False, surface: Surface | None = None) -> None:
-        """As of ``stage.Steps``."""
+        """Does the steps that are left, once per stage. Each is logged, and now and then all is saved.
+
+        Args:
+            work: does them.
+            count: of steps.
+            optimizers: by name; they are saved, and restored where a stage goes on.
+            state: what else to keep for a run that goes on.
+            stalled: whether the stage ends after so many steps, though some are left.
+            surface: that a stage which goes on is given, if another one than this stage was given.
+        """
         runner, stage, first = self._runner, self._stage, self.done
         if first > 0:
             for name, optimizer in optimizers.items():
@@ -161,20 +174,25 @@ class RunnerSteps:
         save(count)
 
     def repeat(self, work: Work, count: int, first: int) -> None:
-        """As of ``stage.Steps``."""
+        """Does all steps once more, logged as those from ``first`` on; a run that goes on does them again."""
         with self._runner.progress.stage(f"{self._stage} again", count) as advance:
             for iteration in range(count):
                 advance(self._runner.step(self._stage, first + iteration, first + count, work, iteration))
 
     @contextmanager
     def task(self, name: str = "", total: int | None = None) -> Iterator[Callable[[], None]]:
-        """As of ``stage.Steps``."""
+        """What is done inside has a line of its own, and counts as time of the stage.
+
+        Args:
+            name: what to call it, after the stage's name.
+            total: how often the function is called that the context gives.
+        """
         shown = f"{self._stage} {name}".strip()
         with self._runner.progress.stage(shown, total) as advance, self._runner.timed(self._stage):
             yield advance
 
     def fact(self, name: str, value: Any) -> None:
-        """As of ``stage.Steps``."""
+        """Something for the metrics; of a JSON type."""
         self._runner.checkpoint.facts[name] = value
 
 

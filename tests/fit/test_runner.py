@@ -9,11 +9,11 @@ import pytest
 from gshell_mi.errors import UserError
 from gshell_mi.fields import sphere
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
-from gshell_mi.fit.bookkeeping.progress import Progress
 from gshell_mi.fit.runner import Runner, checkpoint_path
 from gshell_mi.fit.surface import Moved, Seen, Surface
 from gshell_mi.interrupt import Interrupt
 from gshell_mi.lattice import TetLattice
+from gshell_mi.progress import Progress
 
 COUNT = 3
 START = Surface(sphere(TetLattice(4)))

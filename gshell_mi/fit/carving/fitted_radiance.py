@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ... import losses
-from ..radiance.pixels import PixelPool, PixelSample
+from ...pixels import PixelPool, PixelSample
 from ..radiance.surface_radiance import RadianceConfig, SurfaceRadiance
 from ..stage import Fit
 from ..template import Template

@@ -19,11 +19,11 @@ from scipy import ndimage
 from ...activations import sigmoid, softplus
 from ...compat import mesh_scene
 from ...images import decibels
+from ...pixels import PixelPool
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
 from ..radiance.contrast import Contrast
 from ..radiance.lanes import chosen_lanes
-from ..radiance.pixels import PixelPool
 
 if TYPE_CHECKING:
     from ..stages.cavities import CavitiesConfig

@@ -15,9 +15,11 @@ import numpy as np
 
 from ...compat import mesh_scene
 from ...extraction.surface_mesh import SurfaceMesh
+from ...fields.smoothing import MeshDiffusion
+from ...pixels import COVERED, PixelPool
+from ...template.growth import grown_apart
 from ...views import PinholeViews
 from ..radiance.lanes import chosen_lanes
-from ..radiance.pixels import COVERED, PixelPool
 
 #: Pixels per batch, and batches.
 _BATCH, _BATCHES = 65536, 24
@@ -34,6 +36,18 @@ _COVERAGE = 3.0
 
 #: How far behind the template rays go on, as a fraction of its extent.
 _OFFSET = 1e-4
+
+
+#: Least share of the rays, smoothed, that a vertex meets of those which half of the surface meets. What few
+#: views see into may as well be a fold whose shape is not known.
+_SEEN = 0.5
+
+#: What is to be opened is explained worse than most of the surface by this factor ...
+_WORSE = 1.5
+
+#: ... and what is behind it, which nothing was fitted to yet, worse than it by at most this one. Behind what
+#: is really there it is dozens of times as bad.
+_BEHIND = 4.0
 
 
 @dataclass(frozen=True)
@@ -97,6 +111,31 @@ def residuals_of(template: SurfaceMesh, scene: mi.Scene, integrator, views: Pinh
                     dr.scatter_reduce(dr.ReduceOp.Add, total, weight * values, vertex)
             dr.eval(sums)
         return Residuals(*(total.numpy() for total in sums))
+
+
+def near_openings(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found: Residuals,
+                  smooth: MeshDiffusion, reach: float) -> np.ndarray:
+    """(V,) vertices near openings without which the images would be explained about as well.
+
+    Args:
+        values: (V,) negative where the template is open.
+        vertices, faces: (V, 3) and (F, 3) of the watertight template.
+        found: how well the images are explained through each vertex.
+        smooth: along the template.
+        reach: the longest way along the template between an opening and what opens apart from it, in the
+            unit of the vertices.
+    """
+    solid = values > 0
+    rays, now, without = (smooth(mi.Float(sums.astype(np.float32))).numpy()
+                          for sums in (found.rays, found.now, found.without))
+    met = solid & (rays > 0)
+    if not met.any():
+        return met
+    met &= rays > _SEEN * np.median(rays[met])
+    typical = np.median(now[met] / rays[met])
+    empty = met & (now > _WORSE * typical * rays) & (without < _BEHIND * now)
+    ratio = np.where(empty, without / np.maximum(now, 1e-30), _BEHIND)
+    return grown_apart(solid, empty, ratio, vertices, faces, reach)
 
 
 def _squared_error(scene: mi.Scene, integrator, sampler: mi.Sampler, ray: mi.Ray3f, target: mi.Color3f,

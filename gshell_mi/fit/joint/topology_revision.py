@@ -23,16 +23,16 @@ from scipy.spatial import cKDTree
 
 from ...extraction.surface_mesh import SurfaceMesh
 from ...fields.smoothing import MeshDiffusion
+from ...pixels import PixelPool
+from ...template.growth import grown, joined
 from ...template.msdf import clean_opacity, reopened, rewritten
 from ...template.small_sheets import small_sheets
 from ...topology import boundary_edges, equal_patches, mesh_components, mesh_edges, spread, topology
 from ...triangles import positive_part, vertex_areas
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
-from ..radiance.pixels import PixelPool
-from .growth import grown, joined, near_openings
 from .joint import JointStage
-from .residuals import Residuals, residuals_of
+from .residuals import Residuals, near_openings, residuals_of
 
 #: Lambda that smooths errors along the template, and new rims.
 _SMOOTHING = 3.0

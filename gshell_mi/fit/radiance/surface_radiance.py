@@ -22,6 +22,7 @@ from ... import losses
 from ...activations import inverse_softplus, sigmoid, softplus
 from ...compat import mesh_scene, move_mesh
 from ...fields.smoothing import MeshDiffusion
+from ...pixels import COVERED, PixelPool, PixelSample
 from ...template.normals import vertex_normals
 from ...views import PinholeViews
 from ..bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
@@ -30,7 +31,6 @@ from ..bounds import Between
 from .contrast import Contrast
 from .gloss import PER_SIDE, SHARED, initial_lobe, mirrored_radiance
 from .layers import Sheet, trace_layers
-from .pixels import COVERED, PixelPool, PixelSample
 
 #: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
 #: enough that all are seen; colours fitted at full opacity would bleed what is inside into the caps.

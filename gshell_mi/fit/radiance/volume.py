@@ -17,12 +17,12 @@ from scipy import ndimage
 from ...activations import inverse_softplus, sigmoid, softplus
 from ...bricks import BRICK, Bricks
 from ...images import decibels
+from ...pixels import PixelPool
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
 from .config import VolumeConfig
 from .contrast import Contrast
 from .marching import Adjoint, Rays, composite, depth_along
-from .pixels import PixelPool
 
 #: Voxels per side of each level over those of the last one, and shares of the steps.
 _SIDES, _SHARES = (0.25, 0.5, 1.0), (0.29, 0.29, 0.42)

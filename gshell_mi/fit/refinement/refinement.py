@@ -22,11 +22,11 @@ from ...images import decibels
 from ...means import mean
 from ...outliers import trusted
 from ...schedules import falling
+from ...template.outlines import Outlines
 from ...triangles import face_areas
 from ..bookkeeping.observer import Preview
 from ..radiance.layers import Sheet
 from ..radiance.surface_radiance import SurfaceRadiance
-from .outlines import Outlines
 
 if TYPE_CHECKING:
     from ..stages.refinement import RefinementConfig

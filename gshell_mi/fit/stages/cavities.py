@@ -14,7 +14,8 @@ from ..bounds import Between
 from ..carving.carving import carve
 from ..carving.radiance_volume import RadianceVolume
 from ..carving.vessels import hollowed_vessels
-from ..stage import Fit, Steps
+from ..runner import Steps
+from ..stage import Fit
 from ..surface import Surface
 from ..template import closed_template
 

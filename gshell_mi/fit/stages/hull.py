@@ -18,7 +18,8 @@ from ...lattice import CubeLattice, Lattice
 from ...scene import FitScene
 from ..bounds import Between
 from ..lattices import Lattices
-from ..stage import Fit, Steps
+from ..runner import Steps
+from ..stage import Fit
 from ..surface import TYPICAL_REFLECTANCE, Seen, Surface
 
 if TYPE_CHECKING:

@@ -24,7 +24,8 @@ from ...template.msdf_transfer import transfer_msdf
 from ..bounds import Between
 from ..joint.joint import JointStage
 from ..joint.topology_revision import TopologyRevision
-from ..stage import Fit, Steps
+from ..runner import Steps
+from ..stage import Fit
 from ..surface import TYPICAL_REFLECTANCE, Surface
 
 if TYPE_CHECKING:

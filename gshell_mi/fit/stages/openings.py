@@ -22,14 +22,15 @@ from ...activations import sigmoid, softplus
 from ...errors import UserError
 from ...images import decibels
 from ...means import mean
+from ...pixels import FAINT
 from ...schedules import decay_at
 from ...template.msdf import clean_opacity, msdf_from_template, splat_to_lattice
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from ..radiance.acceptance import close_rejected, open_rejected
-from ..radiance.pixels import FAINT
 from ..radiance.surface_radiance import SurfaceRadiance
-from ..stage import Fit, Steps
+from ..runner import Steps
+from ..stage import Fit
 from ..surface import TYPICAL_REFLECTANCE, Seen, Surface
 from ..template import template_of
 

@@ -12,11 +12,12 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 
+from ...template.outlines import Outlines
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..refinement.early_stopping import EarlyStopping
-from ..refinement.outlines import Outlines
 from ..refinement.refinement import PhotometricRefinement
-from ..stage import Fit, Steps
+from ..runner import Steps
+from ..stage import Fit
 from ..surface import Moved, Surface
 from ..template import Template, template_of
 

@@ -19,7 +19,8 @@ from ...template.thin_sheets import Cut, collapsed_sheets
 from ...template.unseen import without_unseen
 from ...topology import topology
 from ...triangles import positive_part
-from ..stage import Fit, Steps
+from ..runner import Steps
+from ..stage import Fit
 from ..surface import Moved, Seen, Surface
 from ..template import Template, template_of
 

@@ -14,7 +14,8 @@ from ..judge import judge
 from ..radiance.config import VolumeConfig
 from ..radiance.volume import RadianceVolume
 from ..radiance.volume_surface import volume_surface
-from ..stage import Fit, Steps
+from ..runner import Steps
+from ..stage import Fit
 from ..surface import Moved, Surface
 from .revoxelise import best_revoxelised, without_unseen_parts
 

@@ -7,8 +7,8 @@ import pytest
 from cap import cap
 
 from gshell_mi.fields.smoothing import MeshDiffusion
-from gshell_mi.fit.joint.growth import grown, joined, near_openings
-from gshell_mi.fit.joint.residuals import Residuals
+from gshell_mi.fit.joint.residuals import Residuals, near_openings
+from gshell_mi.template.growth import grown, joined
 from gshell_mi.topology import topology
 from gshell_mi.triangles import positive_part
 

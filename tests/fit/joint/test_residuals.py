@@ -9,8 +9,8 @@ import pytest
 
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit.joint.residuals import residuals_of
-from gshell_mi.fit.radiance.pixels import PixelPool
 from gshell_mi.lattice import TetLattice
+from gshell_mi.pixels import PixelPool
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
 

@@ -6,10 +6,10 @@ import numpy as np
 import trimesh
 
 from gshell_mi.fit.radiance.gloss import _HEIGHT, _NODES, initial_lobe, mirrored_radiance
-from gshell_mi.fit.radiance.pixels import PixelPool
 from gshell_mi.fit.radiance.surface_radiance import RadianceConfig, SurfaceRadiance
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement
 from gshell_mi.fit.stages.refinement import RefinementConfig
+from gshell_mi.pixels import PixelPool
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
 

@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from bowl import RADIUS, half_sphere
 
-from gshell_mi.fit.radiance.pixels import PixelPool
 from gshell_mi.fit.radiance.surface_radiance import RadianceConfig, SurfaceRadiance
 from gshell_mi.fit.stages.openings import OpacityTraining, OpeningsConfig
+from gshell_mi.pixels import PixelPool
 from gshell_mi.scene import load_fit_scene
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews

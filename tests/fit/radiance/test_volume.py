@@ -10,10 +10,10 @@ from bowl import RADIUS
 from gshell_mi.fields.visual_hull import visual_hull
 from gshell_mi.fit.bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
 from gshell_mi.fit.radiance.config import VolumeConfig
-from gshell_mi.fit.radiance.pixels import PixelPool
 from gshell_mi.fit.radiance.volume import RadianceVolume
 from gshell_mi.fit.radiance.volume_surface import volume_surface
 from gshell_mi.lattice import make_lattice
+from gshell_mi.pixels import PixelPool
 from gshell_mi.scene import FitScene, load_fit_scene
 from gshell_mi.views import PinholeViews
 

@@ -7,12 +7,12 @@ import pytest
 import trimesh
 
 from gshell_mi.fit.radiance.layers import Sheet
-from gshell_mi.fit.radiance.pixels import PixelPool
 from gshell_mi.fit.radiance.surface_radiance import RadianceConfig, SurfaceRadiance
-from gshell_mi.fit.refinement.outlines import Outlines
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement, _barycentric
 from gshell_mi.fit.stages.refinement import RefinementConfig
+from gshell_mi.pixels import PixelPool
 from gshell_mi.targets import Target
+from gshell_mi.template.outlines import Outlines
 from gshell_mi.views import PinholeViews
 
 RADIUS, SIZE = 0.5, 48

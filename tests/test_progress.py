@@ -2,8 +2,8 @@ import re
 
 import pytest
 
-from gshell_mi.fit.bookkeeping import progress as module
-from gshell_mi.fit.bookkeeping.progress import Progress, usual_duration
+from gshell_mi import progress as module
+from gshell_mi.progress import Progress, usual_duration
 
 
 def test_the_longest_step_does_not_count():

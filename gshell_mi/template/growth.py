@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from ...fields.smoothing import MeshDiffusion
-from ...topology import equal_patches, mesh_edges, spread
-from .residuals import Residuals
-
-#: Least share of the rays, smoothed, that a vertex meets of those which half of the surface meets. What few
-#: views see into may as well be a fold whose shape is not known.
-_SEEN = 0.5
-
-#: What is to be opened is explained worse than most of the surface by this factor ...
-_WORSE = 1.5
-
-#: ... and what is behind it, which nothing was fitted to yet, worse than it by at most this one. Behind what
-#: is really there it is dozens of times as bad.
-_BEHIND = 4.0
+from ..topology import equal_patches, mesh_edges, spread
 
 #: Gaps of up to twice so many edges are grown over.
 _GAP = 1
@@ -32,27 +18,18 @@ _WALL = 2
 _FEWEST = 12
 
 
-def near_openings(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, found: Residuals,
-                  smooth: MeshDiffusion, reach: float) -> np.ndarray:
-    """(V,) vertices near openings without which the images would be explained about as well.
+def grown_apart(solid: np.ndarray, empty: np.ndarray, order: np.ndarray, vertices: np.ndarray,
+                faces: np.ndarray, reach: float) -> np.ndarray:
+    """(V,) vertices by which openings grow into what is empty, without any two of them meeting.
 
     Args:
-        values: (V,) negative where the template is open.
+        solid: (V,) False in openings.
+        empty: (V,) where they may grow; small gaps in it are closed.
+        order: (V,) vertices with lower values go first.
         vertices, faces: (V, 3) and (F, 3) of the watertight template.
-        found: how well the images are explained through each vertex.
-        smooth: along the template.
         reach: the longest way along the template between an opening and what opens apart from it, in the
             unit of the vertices.
     """
-    solid = values > 0
-    rays, now, without = (smooth(mi.Float(sums.astype(np.float32))).numpy()
-                          for sums in (found.rays, found.now, found.without))
-    met = solid & (rays > 0)
-    if not met.any():
-        return met
-    met &= rays > _SEEN * np.median(rays[met])
-    typical = np.median(now[met] / rays[met])
-    empty = met & (now > _WORSE * typical * rays) & (without < _BEHIND * now)
     edges, _ = mesh_edges(faces)
     reached = ~solid | empty
     for _ in range(_GAP):
@@ -62,15 +39,14 @@ def near_openings(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray, f
     # Around an island an opening would meet itself; what is smaller than a place that grows does not stay.
     patch = equal_patches(reached, faces)
     reached |= np.bincount(patch)[patch] < _FEWEST
-    ratio = np.where(empty, without / np.maximum(now, 1e-30), _BEHIND)
     opened = ~solid
-    apart = reached & ~spread(grown(opened, reached, ratio, faces), edges)
-    opened[_seeds(apart, ratio, _distances(_ways(vertices, faces), opened, reach)[0], faces)] = True
-    blocked = reached & ~grown(opened, reached, ratio, faces)
+    apart = reached & ~spread(grown(opened, reached, order, faces), edges)
+    opened[_seeds(apart, order, _distances(_ways(vertices, faces), opened, reach)[0], faces)] = True
+    blocked = reached & ~grown(opened, reached, order, faces)
     # A rim moves: what parts two rims has to be wide enough to outlast that.
     for _ in range(_WALL):
         blocked = spread(blocked, edges)
-    added = grown(opened, reached & ~blocked, ratio, faces) & solid
+    added = grown(opened, reached & ~blocked, order, faces) & solid
     patch = equal_patches(added, faces)
     return added & (np.bincount(patch)[patch] >= _FEWEST)
 

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ...targets import Target
-from ...views import PinholeViews
+from .targets import Target
+from .views import PinholeViews
 
 #: Coverage of a pixel from which on nothing of the background is in it.
 COVERED = 0.99

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from gshell_mi.fit.radiance.pixels import PixelPool
+from gshell_mi.pixels import PixelPool
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
 

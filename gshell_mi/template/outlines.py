@@ -6,10 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...fields.mask_outline import mask_distance, sharp
-from ...template.normals import vertex_normals
-from ...topology import mesh_edges
-from ...views import PinholeViews
+from ..fields.mask_outline import mask_distance, sharp
+from ..topology import mesh_edges
+from ..views import PinholeViews
+from .normals import vertex_normals
 
 #: A contour point belongs to the outer silhouette if the ray this many pixels beyond it meets nothing.
 _CLEARANCE = 1.5

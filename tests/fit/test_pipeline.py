@@ -1,0 +1,62 @@
+"""Which stages a fit has, and what they need."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from gshell_mi import extras  # noqa: F401 registers parametrisations
+from gshell_mi.fields import LatticeFields, sphere
+from gshell_mi.fit import FitConfig
+from gshell_mi.fit.lattices import Lattices
+from gshell_mi.fit.pipeline import pipeline
+from gshell_mi.lattice import TetLattice
+
+START = ["openings", "cavities", "refinement", "folds", "revoxelise"]
+
+
+def names(subject: mi.Shape, settings: dict) -> list[str]:
+    config = FitConfig().changed(settings)
+    stages = pipeline(SimpleNamespace(subject=subject), Lattices.of(subject, config), config)
+    return [stage.name for stage in stages]
+
+
+@pytest.mark.parametrize(("settings", "expected"), [
+    ({}, ["hull", *START, "volume", "joint", "detail"]),
+    ({"volume.iterations": 0}, ["hull", *START, "joint", "detail"]),
+    ({"iterations": 0}, ["hull", *START, "volume", "joint"]),
+    ({"detail.iterations": 0}, ["hull", *START, "volume", "joint"]),
+    ({"model.field": "hashgrid"}, ["hull", *START, "volume", "joint"]),
+    ({"model.field": "flexicubes"}, ["hull", *START, "volume", "joint", "detail"]),
+])
+def test_stages_from_masks(settings, expected):
+    assert names(mi.load_dict({"type": "gshell", "resolution": 12}), settings) == expected
+
+
+@pytest.mark.parametrize(("opened", "settings", "expected"), [
+    (True, {}, ["given", "joint", "detail"]),
+    (False, {}, ["given", *START, "joint", "detail"]),
+    (True, {"watertight": True}, ["given", *START, "joint", "detail"]),
+])
+def test_stages_from_given_fields(tmp_path, opened, settings, expected):
+    ball = sphere(TetLattice(12))
+    msdf = ball.msdf - 2 * np.float32(opened)
+    LatticeFields(ball.sdf, msdf, ball.deform).save(tmp_path / "fields.npz")
+    subject = mi.load_dict({"type": "gshell", "filename": str(tmp_path / "fields.npz")})
+    assert names(subject, settings) == expected
+
+
+def test_no_stage_needs_what_is_made_of_a_fit():
+    """A fit in a program of its own has neither a report, nor films, nor a page."""
+    code = """if True:
+        import sys
+        import gshell_mi.fit, gshell_mi.fit.pipeline, gshell_mi.fit.runner, gshell_mi.fit.fitted
+        above = {f"gshell_mi.{room}" for room in ("export", "report", "turntable", "viewer", "capture")}
+        assert not above & set(sys.modules), above & set(sys.modules)
+        from gshell_mi.fit import FitResult, fit_scene
+        assert "gshell_mi.report" in sys.modules
+    """
+    subprocess.run([sys.executable, "-c", code], check=True)
