@@ -23,7 +23,7 @@ _MOVED = {
                                                    "radiance-lr", "direction-lr", "mask", "distortion")},
     "render": {"step-views": "views"} | {name: name for name in ("spp", "primal-spp", "max-depth",
                                                                  "gradient-depth", "reparam-depth")},
-    "model": {name: name for name in ("field", "color-voxels", "even-start", "light-height")}
+    "model": {name: name for name in ("field", "color-voxels", "light-height")}
              | {"flexicubes-weights": "field flexicubes", "no-even-start": "no-even-start"},
     "losses": {"image-loss": "image", "joint-mask": "mask", "joint-depth": "depth"}
               | {name: name for name in ("material-smoothness", "light-grey", "flexicubes-deviation")}

@@ -260,7 +260,7 @@ def test_flags_of_earlier_versions_are_told_the_new_name(old, capfd):
 def test_the_new_names_are_settings():
     names = {name.replace("_", "-") for name in FitConfig().settings()} | {"effort"}
     found = {new.split(" ")[0].replace("no-", "") for new in RENAMED.values()}
-    assert found <= names and len(RENAMED) > 80
+    assert found <= names and len(RENAMED) > 75
     assert not RENAMED.keys() & names, "what is called so still is no old name"
 
 
