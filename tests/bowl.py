@@ -13,14 +13,13 @@ SIZE = 48
 #: Options of the command that make the fit short. Those of the openings suit so small a scene and few steps.
 SHORT = ("--openings.iterations", "100", "--radiance.batch", "4096", "--radiance.smoothing", "8",
          "--openings.mask", "0.01", "--openings.binary", "0.015", "--openings.closing", "0.003",
-         "--openings.gain", "100", "--cavities.opening-gain", "100",
          "--cavities.iterations", "10", "--cavities.batch", "4096", "--volume.iterations", "0",
          "--refinement.iterations", "8", "--folds.iterations", "0", "--iterations", "12",
          "--render.spp", "2", "--render.primal-spp", "4", "--render.max-depth", "2",
          "--model.light-height", "8", "--no-report")
 
 #: Added to these where openings do not matter: hardly any steps, and the template stays closed.
-CLOSED = ("--openings.iterations", "5", "--openings.gain", "0", "--cavities.opening-gain", "0",
+CLOSED = ("--openings.iterations", "5",
           "--cavities.iterations", "4", "--refinement.iterations", "2")
 
 

@@ -1,29 +1,26 @@
-"""Which of two surfaces explains the images better: the same unseen rays through both."""
+"""The judge of the fit: does a change explain unseen views better? The same rays through before and after."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import losses
 from ..compat import mesh_scene
 from ..fields.smoothing import MeshDiffusion
-from ..pixels import COVERED, PixelPool
+from ..pixels import COVERED, PixelPool, PixelSample
 from ..targets import Target
 from ..views import PinholeViews
-
-if TYPE_CHECKING:
-    from .config import FitConfig
+from .radiance.contrast import Contrast
 
 #: Pixels this near to a mask's outline do not judge: where a surface ends to a cell is found later.
 _OUTLINE = 3
 
 #: Batches of rays that tell the colours, and that judge.
-_LEARNT, _JUDGED = 60, 20
+_LEARNT, _JUDGED = 40, 20
 
 #: Lambda that spreads colours along a mesh to vertices that hardly a ray comes near.
 _SMOOTHING = 0.5
@@ -31,83 +28,174 @@ _SMOOTHING = 0.5
 #: Standard errors by which a change has to be better.
 _SURE = 2.0
 
+#: Views that have to tell of a place before their spread does.
+_VIEWS = 4
+
+#: Vertices (V, 3) and faces (F, 3).
+Mesh = tuple[np.ndarray, np.ndarray]
+
 
 @dataclass(frozen=True)
 class Verdict:
-    """How much better a surface after a change explains unseen views.
+    """How much better a surface after a change explains unseen views, at P places.
 
     Attributes:
-        before, after: mean error of a ray.
-        gain: mean, over the unseen views, of the error before less that after.
-        noise: standard error of the gain. Views are independent of each other, rays of one view are not.
+        before, after: (P,) mean error of a ray.
+        gain: (P,) mean, over the unseen views, of the error before less that after.
+        noise: (P,) standard error of the gain; infinite where hardly a view tells. Views are independent of
+            each other, rays of one view are not.
     """
 
-    before: float
-    after: float
-    gain: float
-    noise: float
+    before: np.ndarray
+    after: np.ndarray
+    gain: np.ndarray
+    noise: np.ndarray
 
     @property
-    def accepted(self) -> bool:
-        """Whether the gain is no accident."""
+    def accepted(self) -> np.ndarray:
+        """(P,) whether the gain is no accident."""
         return self.gain > _SURE * self.noise
 
+    def facts(self) -> dict[str, list[float]]:
+        """For ``metrics.json``: gain and noise of each place."""
+        return {"gain": [round(float(value), 5) for value in self.gain],
+                "noise": [round(float(value), 5) if np.isfinite(value) else -1.0 for value in self.noise]}
 
-def judge(before: tuple[np.ndarray, np.ndarray], after: tuple[np.ndarray, np.ndarray], views: PinholeViews,
-          targets: list[Target], config: FitConfig) -> Verdict:
-    """Compares two surfaces, each given as vertices (V, 3) and faces (F, 3).
 
-    Each has the mean colour that half of the views show it in, of one side and of the other, and the other
-    half judges; then the other way round. Whatever neither can explain so, such as gloss, texture finer than
-    the meshes, poses and noise, is in both errors and cancels in their difference.
+@dataclass(frozen=True)
+class Shown:
+    """A mesh in the mean colours that images show it in.
+
+    Attributes:
+        scene: of the mesh alone.
+        corners: (3 F,) vertex indices.
+        colors: for each split of the views, (2 V * 3) of both sides of the vertices.
+    """
+
+    scene: mi.Scene
+    corners: mi.UInt32
+    colors: list[mi.Float]
+
+    def look(self, ray: mi.Ray3f, split: int) -> tuple[mi.Color3f, mi.Float]:
+        """Radiance and coverage along rays."""
+        radiance, alpha = mi.Color3f(0), mi.Float(0)
+        for index, weight, hit in _sides(self.scene, self.corners, ray):
+            radiance += weight * dr.gather(mi.Color3f, self.colors[split], index, hit)
+            alpha = dr.select(hit, 1, alpha)
+        dr.eval(radiance, alpha)
+        return radiance, alpha
+
+
+class Judge:
+    """Decides on every discrete change of the surface, by one rule.
+
+    Before and after, each mesh has the mean colour that some views show it in, of one side and of the other,
+    and others judge. Whatever neither can explain so, such as
+    gloss, texture finer than the meshes, poses and noise, is in both errors and cancels in their difference:
+    a change counts if the mean of that over the views is above twice its standard error.
 
     Args:
         views, targets: the images. Pixels beside the masks' outlines do not count.
+        splits: indices of the views that tell the colours, and of those that judge; one pair or more.
+        batch: pixels per batch of rays.
+        seed: of the random pixels.
     """
-    every, errors = np.arange(len(views)), []
-    for half in (every[::2], every[1::2]):
-        other = np.setdiff1d(every, half) if len(every) > 1 else every
-        if not len(half):
-            continue
-        known, unknown = PixelPool(views, targets, other), PixelPool(views, targets, half, _OUTLINE)
-        (rays, first), (_, second) = (_errors_by_view(surface, views, known, unknown, config)
-                                      for surface in (before, after))
-        errors.append(np.stack([first[half], second[half]])[:, rays[half] > 0] / rays[half][rays[half] > 0])
-    errors = np.concatenate(errors, axis=1)
-    difference = errors[0] - errors[1]
-    noise = difference.std(ddof=1) / np.sqrt(len(difference)) if len(difference) > 1 else np.inf
-    return Verdict(float(errors[0].mean()), float(errors[1].mean()), float(difference.mean()), float(noise))
+
+    def __init__(self, views: PinholeViews, targets: list[Target],
+                 splits: list[tuple[np.ndarray, np.ndarray]], *, batch: int, seed: int = 0):
+        self.views, self.targets, self.splits = views, targets, splits
+        self.batch, self.seed = batch, seed
+
+    @staticmethod
+    def halves(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Splits of views: either half judges once what it has not told the colours of."""
+        every = np.arange(count)
+        return [(every[1::2], every[::2]), (every[::2], every[1::2])] if count > 1 else [(every, every)]
+
+    @cached_property
+    def _pools(self) -> list[tuple[PixelPool, PixelPool]]:
+        """Pixels that tell the colours, and those that judge."""
+        return [(PixelPool(self.views, self.targets, known),
+                 PixelPool(self.views, self.targets, unknown, _OUTLINE)) for known, unknown in self.splits]
+
+    def shown(self, mesh: Mesh) -> Shown:
+        """A mesh in the colours of the images."""
+        vertices, faces = mesh
+        scene, corners = mesh_scene(vertices, faces), mi.UInt32(faces.astype(np.uint32).ravel())
+        colors = []
+        with dr.suspend_grad():
+            for known, _ in self._pools:
+                sums = [dr.zeros(mi.Float, 2 * len(vertices)) for _ in range(4)]
+                for step in range(_LEARNT):
+                    sample = known.sample(self.batch, seed=self.seed, step=step)
+                    whole = sample.alpha > COVERED
+                    for index, weight, hit in _sides(scene, corners, self._rays(sample)):
+                        for total, value in zip(sums, (*sample.radiance, mi.Float(1)), strict=True):
+                            dr.scatter_reduce(dr.ReduceOp.Add, total, weight * value, index, hit & whole)
+                    dr.eval(sums)
+                colors.append(_means(sums, faces, len(vertices)))
+        return Shown(scene, corners, colors)
+
+    def compare(self, before: Shown, after: Shown, places: tuple[Mesh, np.ndarray] | None = None) -> Verdict:
+        """Judges a change.
+
+        Args:
+            before, after: the surface without and with the change.
+            places: a mesh and (V,) which change its vertices tell of, from 0; -1 where of none. A ray judges
+                the change at the vertex that it meets first. Default: all rays judge one change.
+        """
+        label, where, corners = np.zeros(1, np.int32), None, None
+        if places:
+            (vertices, faces), label = places
+            where, corners = mesh_scene(vertices, faces), mi.UInt32(faces.astype(np.uint32).ravel())
+        count, views = int(label.max()) + 1, len(self.views)
+        sums = [dr.zeros(mi.Float, max(count, 1) * views) for _ in range(3)]
+        labels, most = mi.Int32(label.astype(np.int32)), dr.opaque(mi.UInt32, views)
+        with dr.suspend_grad():
+            for split, (_, pixels) in enumerate(self._pools):
+                tone = Contrast(pixels.mean_radiance())
+                coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0))
+                for step in range(_JUDGED):
+                    sample = pixels.sample(self.batch, seed=self.seed, step=step)
+                    ray, place, counts = self._rays(sample), mi.Int32(0), mi.Bool(True)
+                    if where:
+                        hit = where.ray_intersect_preliminary(ray, coherent=False)
+                        dr.eval(hit)
+                        corner = dr.gather(mi.UInt32, corners, 3 * hit.prim_index, hit.is_valid())
+                        place = dr.gather(mi.Int32, labels, corner, hit.is_valid())
+                        counts = hit.is_valid() & (place >= 0)
+                        dr.eval(place, counts)
+                    lane = mi.UInt32(dr.maximum(place, 0)) * most + sample.view
+                    errors = []
+                    for shown in (before, after):
+                        radiance, alpha = shown.look(ray, split)
+                        error = dr.abs(tone(radiance) - tone(sample.radiance))
+                        errors.append(dr.sum(error) + coverage * dr.abs(alpha - sample.alpha))
+                    for total, value in zip(sums, (mi.Float(1), *errors), strict=True):
+                        dr.scatter_reduce(dr.ReduceOp.Add, total, value, lane, counts)
+                    dr.eval(sums)
+        return _verdict(*(total.numpy().reshape(-1, views) for total in sums))
+
+    def decide(self, before: Mesh, after: Mesh) -> Verdict:
+        """Judges one change of the whole surface."""
+        return self.compare(self.shown(before), self.shown(after))
+
+    def _rays(self, sample: PixelSample) -> mi.Ray3f:
+        return self.views.rays(sample.view, sample.film)
 
 
-def _errors_by_view(surface: tuple[np.ndarray, np.ndarray], views: PinholeViews, known: PixelPool,
-                    unknown: PixelPool, config: FitConfig) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) rays of each view and the sums of their errors."""
-    vertices, faces = surface
-    scene, corners = mesh_scene(vertices, faces), mi.UInt32(faces.astype(np.uint32).ravel())
-    sums = [dr.zeros(mi.Float, 2 * len(vertices)) for _ in range(4)]
-    rays, errors = (dr.zeros(mi.Float, len(views)) for _ in range(2))
-    with dr.suspend_grad():
-        for step in range(_LEARNT):
-            sample = known.sample(config.radiance.batch, seed=config.seed, step=step)
-            whole = sample.alpha > COVERED
-            for index, weight, hit in _sides(scene, corners, views.rays(sample.view, sample.film)):
-                for total, value in zip(sums, (*sample.radiance, mi.Float(1)), strict=True):
-                    dr.scatter_reduce(dr.ReduceOp.Add, total, weight * value, index, hit & whole)
-            dr.eval(sums)
-        colors = _means(sums, faces, len(vertices))
-        coverage = dr.opaque(mi.Float, 3 * unknown.mask_weight(1.0))
-        for step in range(_JUDGED):
-            sample = unknown.sample(config.radiance.batch, seed=config.seed, step=step)
-            radiance, alpha = mi.Color3f(0), mi.Float(0)
-            for index, weight, hit in _sides(scene, corners, views.rays(sample.view, sample.film)):
-                radiance += weight * mi.Color3f(*(dr.gather(mi.Float, color, index, hit) for color in colors))
-                alpha = dr.select(hit, 1, alpha)
-            error = dr.abs(losses.tonemap(radiance) - losses.tonemap(sample.radiance))
-            error = dr.sum(error) + coverage * dr.abs(alpha - sample.alpha)
-            dr.scatter_reduce(dr.ReduceOp.Add, rays, mi.Float(1), sample.view)
-            dr.scatter_reduce(dr.ReduceOp.Add, errors, error, sample.view)
-            dr.eval(rays, errors)
-    return rays.numpy(), errors.numpy()
+def _verdict(rays: np.ndarray, before: np.ndarray, after: np.ndarray) -> Verdict:
+    """From (P, N) rays of each place and view, and the sums of their errors."""
+    seen = (rays > 0).sum(axis=1)
+    mean = np.maximum(rays.sum(axis=1), 1) / np.maximum(seen, 1)
+    # Sums over mean numbers: a view that hardly sees a place has hardly a say.
+    difference = (before - after) / mean[:, None]
+    gain = difference.sum(axis=1) / np.maximum(seen, 1)
+    spread = np.where(rays > 0, (difference - gain[:, None] * rays / mean[:, None]) ** 2, 0).sum(axis=1)
+    noise = np.sqrt(spread / np.maximum(seen - 1, 1) / np.maximum(seen, 1))
+    noise[seen < _VIEWS] = np.inf
+    total = np.maximum(rays.sum(axis=1), 1)
+    return Verdict(before.sum(axis=1) / total, after.sum(axis=1) / total, gain, noise)
 
 
 def _sides(scene: mi.Scene, corners: mi.UInt32, ray: mi.Ray3f) -> list[tuple[mi.UInt32, mi.Float, mi.Bool]]:
@@ -124,14 +212,13 @@ def _sides(scene: mi.Scene, corners: mi.UInt32, ray: mi.Ray3f) -> list[tuple[mi.
             for vertex, weight in zip(vertices, weights, strict=True)]
 
 
-def _means(sums: list[mi.Float], faces: np.ndarray, count: int) -> list[mi.Float]:
-    """(2 V,) mean red, green and blue of each vertex' sides, from weighted sums and the weights."""
+def _means(sums: list[mi.Float], faces: np.ndarray, count: int) -> mi.Float:
+    """(2 V * 3) mean colour of each vertex' sides, from weighted sums and the weights."""
     smooth = MeshDiffusion(faces, count, _SMOOTHING)
     side = 2 * dr.arange(mi.UInt32, count)
-    means = [dr.zeros(mi.Float, 2 * count) for _ in range(3)]
+    means = dr.zeros(mi.Float, 6 * count)
     for back in range(2):
         *colors, weight = (dr.maximum(smooth(dr.gather(mi.Float, total, side + back)), 0) for total in sums)
-        for mean, color in zip(means, colors, strict=True):
-            dr.scatter(mean, color / dr.maximum(weight, 1e-6), side + back)
+        dr.scatter(means, mi.Color3f(*colors) / dr.maximum(weight, 1e-6), side + back)
     dr.eval(means)
     return means

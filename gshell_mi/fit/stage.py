@@ -13,6 +13,7 @@ from ..pixels import PixelPool
 from ..scene import FitScene
 from ..views import PinholeViews
 from .bookkeeping.observer import Preview
+from .judge import Judge
 from .lattices import Lattices
 from .surface import Surface
 
@@ -56,14 +57,28 @@ class Fit:
     @cached_property
     def training(self) -> PixelPool:
         """The pixels of the views that are not held out."""
-        every = np.arange(len(self.views))
-        chosen = np.setdiff1d(every, every[::_HOLD_OUT]) if len(every) > 1 else every
-        return PixelPool(self.views, self.scene.targets, chosen)
+        return PixelPool(self.views, self.scene.targets, self._held_out[0])
 
     @cached_property
-    def held_out(self) -> PixelPool:
-        """The pixels of the views that judge."""
-        return PixelPool(self.views, self.scene.targets, np.arange(len(self.views))[::_HOLD_OUT])
+    def judge(self) -> Judge:
+        """Decides on changes that were proposed by all views."""
+        return self._judge(Judge.halves(len(self.views)))
+
+    @cached_property
+    def held_out_judge(self) -> Judge:
+        """Decides on what was fitted to the ``training`` pixels."""
+        return self._judge([self._held_out])
+
+    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]]) -> Judge:
+        config = self.config
+        return Judge(self.views, self.scene.targets, splits, batch=config.radiance.batch, seed=config.seed)
+
+    @property
+    def _held_out(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the views that shapes are fitted to, and of the others."""
+        every = np.arange(len(self.views))
+        held_out = every[::_HOLD_OUT]
+        return np.setdiff1d(every, held_out) if len(every) > 1 else every, held_out
 
     def cell(self, surface: Surface) -> float:
         """Side of a cell of a surface's lattice in world units."""

@@ -40,14 +40,12 @@ class Moved:
         stage: its name.
         positions: (V, 3) world positions.
         radiance: (V, 3) of the outer side.
-        error: mean image loss of the views that it did not see.
         fitted: the radiance's optimiser, for a stage that goes on from there.
     """
 
     stage: str
     positions: np.ndarray
     radiance: np.ndarray
-    error: float
     fitted: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
@@ -94,7 +92,7 @@ class Surface:
             arrays |= {name: getattr(self.seen, name) for name in ("radiance", "known", "light")}
         for index, moved in enumerate(self.moved):
             arrays |= {f"moved {index} {moved.stage} {name}": np.asarray(getattr(moved, name))
-                       for name in ("positions", "radiance", "error")}
+                       for name in ("positions", "radiance")}
             arrays |= {f"moved {index} {moved.stage} fitted {name}": array
                        for name, array in moved.fitted.items()}
         for part in ("model", "revision"):
@@ -117,8 +115,7 @@ class Surface:
 
 
 def _moved(stage: str, arrays: Mapping[str, np.ndarray]) -> Moved:
-    return Moved(stage, arrays["positions"], arrays["radiance"], float(arrays["error"]),
-                 _under(arrays, "fitted "))
+    return Moved(stage, arrays["positions"], arrays["radiance"], _under(arrays, "fitted "))
 
 
 def _under(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

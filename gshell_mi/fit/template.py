@@ -12,6 +12,7 @@ from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..fields.thin_parts import back_on_solid
 from ..lattice import Lattice
+from ..triangles import positive_part
 from .surface import Surface
 
 #: A template takes its opacity from another one that is at most this many cells away ...
@@ -38,6 +39,16 @@ class Template:
     faces: np.ndarray
     logits: np.ndarray
     start: np.ndarray
+
+    @property
+    def closed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and faces before thin parts were grown, openings closed."""
+        return self.start, self.faces
+
+    @property
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and faces of what is surface, before thin parts were grown."""
+        return positive_part(self.start, self.faces, self.logits)
 
     @property
     def solid(self) -> np.ndarray:

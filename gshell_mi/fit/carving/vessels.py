@@ -5,7 +5,8 @@ back of the hull's walls, as if these were as thin as cloth. The inside of a mug
 thickness of its wall, so every view sees it elsewhere. Therefore each space behind openings is also tried as
 a hollow: all of the hull goes but a wall. If that explains unseen views much better, the space is a hollow,
 and the openings into it are none. Behind the openings of cloth such a wall explains them worse, by factors;
-so one thickness tells, and only for a vessel is it varied, as is the hollow's depth.
+so one thickness tells, and only for a vessel is it varied, as is the hollow's depth. Each step counts only if
+unseen views speak for it.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import ndimage
@@ -21,52 +21,44 @@ from scipy.spatial import cKDTree
 
 from ...template.msdf import msdf_from_template, splat_to_lattice
 from ...topology import equal_patches
-from ..radiance.surface_radiance import SurfaceRadiance
+from ..judge import Shown
 from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import Template, template_of
-from .fitted_radiance import fitted_radiance, ray_errors
+from .fitted_radiance import fitted_radiance
 from .hollows import hollowed
 
 #: Thickness of a wall, in cells, that tells vessels; those that are tried for them then.
 _TELLING, _THINNER, _THICKER = 2.5, (1.5,), (4.0, 6.0, 9.0)
 
-#: Depths that are tried, as fractions of the deepest. Few views see the bottom, so what a shallower hollow
-#: brings must be more than noise: it counts if errors fall below this fraction.
-_DEPTHS, _SHALLOWER = (0.75, 0.5, 0.25), 0.9
+#: Depths that are tried, as fractions of the deepest.
+_DEPTHS = 0.75, 0.5, 0.25
 
 #: Vertices up to this many cells from an opening lie right behind it, and hollows are deeper than this.
 _BEHIND, _SHALLOW = 1.5, 4.0
-
-#: Share of a batch, and rounds of fitting, that tell: errors differ by factors.
-_BATCH, _ROUNDS = 0.25, 1
-
-#: Fewest rays through openings that tell, and batches of rays.
-_ENOUGH, _ERROR_STEPS = 100, 20
 
 #: Logit of a vertex that is taken to be surface.
 _CERTAIN = 3.0
 
 
-def hollowed_vessels(fit: Fit, surface: Surface, gain: float) -> Surface | None:
+def hollowed_vessels(fit: Fit, surface: Surface) -> Surface | None:
     """Hollows a template out behind openings where that explains held-out views much better.
 
     Args:
         fit: the views.
         surface: with its hull, on a lattice whose vertices make a cube.
-        gain: fraction of the error without a wall below which a wall is one; 0 tries none.
 
     Returns:
         The hollowed surface and what was seen of it; None if no opening leads into a hollow.
     """
     template = template_of(fit.scene.subject, surface)
-    if template.solid.all() or not template.solid.any() or not gain:
+    if template.solid.all() or not template.solid.any():
         return None
-    vessel = _Trials(fit, surface, template, gain).best()
+    vessel = _Trials(fit, surface, template).best()
     if vessel is None:
         return None
     carved, lattice = vessel.template, surface.lattice
-    front, _ = vessel.appearance.radiance()
+    front, _ = fitted_radiance(carved, fit).radiance()
     radiance, found = splat_to_lattice(mi.Float(front.ravel()), carved.mesh, lattice)
     msdf = msdf_from_template(carved.logits, carved.mesh, lattice)
     seen = Seen(radiance.numpy().reshape(-1, 3), found.numpy(), surface.seen.light)
@@ -99,34 +91,24 @@ class _Vessel:
     Attributes:
         surface: what it comes from, but for the openings that are none.
         template: without the openings into the hollow.
-        appearance: fitted to it.
-        errors: (V,) of rays, by the vertex of the template without the hollow that they meet first.
+        shown: to the judge.
     """
 
     hollow: _Hollow
     surface: Surface
     template: Template
-    appearance: SurfaceRadiance
-    errors: np.ndarray
-
-    @property
-    def error(self) -> float:
-        """Of the rays into the hollow."""
-        return self.errors[self.hollow.mouth].sum()
+    shown: Shown
 
 
 class _Trials:
     """Tries hollows behind the openings of a template; arguments as of ``hollowed_vessels``."""
 
-    def __init__(self, fit: Fit, surface: Surface, template: Template, gain: float):
-        self.fit, self.surface, self.template, self.gain = fit, surface, template, gain
+    def __init__(self, fit: Fit, surface: Surface, template: Template):
+        self.fit, self.surface, self.template = fit, surface, template
         self.lattice = surface.lattice
-        batch = max(round(_BATCH * fit.config.radiance.batch), 1)
-        self.config = replace(fit.config.radiance, batch=batch)
         points = mi.Transform4f(fit.scene.subject.to_world) @ self.lattice.points(mi.Float)
         self._inside = surface.hull < 0
         self._points = points.numpy().T[self._inside]
-        self._sheet = self._fitted(template)
 
     def best(self) -> _Vessel | None:
         """The vessel that explains most; None if there is none."""
@@ -135,14 +117,14 @@ class _Trials:
         if first is None:
             return None
         space = first.hollow.space
-        before, rays = self._errors(self._sheet)
-        error, was, enough = (np.bincount(space[opened], values[opened], space.max() + 1)
-                              for values in (first.errors, before, rays))
-        hollow = (error < self.gain * was) & (enough >= _ENOUGH)
-        mouth = opened & hollow[space]
+        place = np.where(opened, space, -1)
+        verdict = self.fit.judge.compare(self.fit.judge.shown(self.template.surface), first.shown,
+                                         (self.template.closed, place))
+        hollow = np.append(verdict.accepted, False)
+        mouth = opened & hollow[place]
         if not mouth.any():
             return None
-        if not hollow[space[opened]].all():
+        if (mouth != opened).any():
             first = self._vessel(mouth, _TELLING)
             if first is None:
                 return None
@@ -150,14 +132,15 @@ class _Trials:
         if best is first:
             best = self._better(first, ((thickness, np.inf) for thickness in _THINNER))
         wall, depth = best.hollow.thickness, best.hollow.depth
-        return self._better(best, ((wall, fraction * depth) for fraction in _DEPTHS), _SHALLOWER)
+        return self._better(best, ((wall, fraction * depth) for fraction in _DEPTHS))
 
-    def _better(self, best: _Vessel, others: Iterable[tuple[float, float]], gain: float = 1.0) -> _Vessel:
-        """The last one of a sequence of walls and depths up to which errors fall, each below the fraction
-        ``gain`` of the one before."""
+    def _better(self, best: _Vessel, others: Iterable[tuple[float, float]]) -> _Vessel:
+        """The last one of a sequence of walls and depths up to which each is better than the one before."""
         for thickness, depth in others:
-            other = self._vessel(best.hollow.mouth, thickness, depth)
-            if other is None or other.error >= gain * best.error:
+            mouth = best.hollow.mouth
+            other = self._vessel(mouth, thickness, depth)
+            places = self.template.closed, np.where(mouth, 0, -1)
+            if other is None or not self.fit.judge.compare(best.shown, other.shown, places).accepted[0]:
                 break
             best = other
         return best
@@ -170,8 +153,7 @@ class _Trials:
         surface = hollowed(self.surface, hollow.distance)
         closed = replace(self.template, logits=np.where(mouth, _CERTAIN, self.template.logits))
         carved = template_of(self.fit.scene.subject, surface, like=closed)
-        appearance = self._fitted(carved)
-        return _Vessel(hollow, surface, carved, appearance, self._errors(appearance)[0])
+        return _Vessel(hollow, surface, carved, self.fit.judge.shown(carved.surface))
 
     def _hollow(self, mouth: np.ndarray, thickness: float, depth: float) -> _Hollow | None:
         """What lies behind openings and deeper than a wall; None if that is nothing."""
@@ -198,25 +180,3 @@ class _Trials:
         votes = np.zeros((1 + opening.max(), 1 + part.max()))
         np.add.at(votes, (opening[mouth], space[mouth]), 1)
         return _Hollow(mouth, thickness, to_mouth[inside].max(), distance, votes.argmax(axis=1)[opening])
-
-    def _fitted(self, template: Template) -> SurfaceRadiance:
-        return fitted_radiance(template, self.fit, self.config, rounds=_ROUNDS)
-
-    def _errors(self, appearance: SurfaceRadiance) -> tuple[np.ndarray, np.ndarray]:
-        """(V,) sums of a template's errors, and numbers of rays, by the vertex that these meet first."""
-        pixels, seed = self.fit.held_out, self.fit.config.seed
-        errors, rays = (dr.zeros(mi.Float, len(self.template.vertices)) for _ in range(2))
-        vertex = mi.UInt32(self.template.faces[:, 0].astype(np.uint32))
-        with dr.suspend_grad():
-            for step in range(_ERROR_STEPS):
-                sample = pixels.sample(self.config.batch, seed=seed, step=step)
-                ray = self.fit.views.rays(sample.view, sample.film)
-                hit = self._sheet.scene.ray_intersect_preliminary(ray, coherent=False)
-                # On a GPU, a kernel traces rays in one scene only.
-                dr.eval(hit)
-                first = dr.gather(mi.UInt32, vertex, hit.prim_index, hit.is_valid())
-                error = ray_errors(appearance, ray, sample, pixels)
-                for total, values in ((errors, error), (rays, mi.Float(1))):
-                    dr.scatter_reduce(dr.ReduceOp.Add, total, values, first, hit.is_valid())
-                dr.eval(errors, rays)
-        return errors.numpy(), rays.numpy()

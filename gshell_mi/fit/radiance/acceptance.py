@@ -1,80 +1,73 @@
-"""Which openings of a template, and which islands in them, the images justify."""
+"""Which openings of a template, and which islands in them, unseen views speak for."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 
 from ...topology import equal_patches, mesh_edges, patch_sizes, spread, vertex_components
+from ...triangles import positive_part
+from ..judge import Judge, Mesh
 
 #: Openings are parted where they are at most twice this many vertices wide.
 _NECK = 2
-
-#: Openings below this fraction of the template's vertices have to be justified the better, by this factor,
-#: and by every choice of pixels: a bulge beside a handle is small, and few rays tell of a small opening.
-_SMALL, _STRICTER = 0.05, 0.725
 
 #: Rounds in which openings are closed, each time those that are this near to the worst; in the last one all.
 _CLOSINGS, _WORST = 5, 0.5
 
 
-def close_rejected(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.ndarray], np.ndarray],
-                   gain: float) -> np.ndarray:
-    """Closes the openings through which the images are not explained better than without them.
+def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge) -> np.ndarray:
+    """Closes the openings through which unseen views are not explained better than without them.
 
     A hull that bulges over a fold, or a highlight, makes the views disagree on a vertex's radiance as a
     cap does, and may open there. But the sheet behind such a hole is farther from the truth than the hull,
-    so the images disagree more. Where a hull bulges into daylight, beside a handle, the daylight alone would
-    justify a small opening; pixels that are wholly covered do not. The inside of a skirt may be so dark that
-    daylight, seen through its waist, is all that speaks for its hem.
-
-    What hangs together by a narrow neck only is judged in parts. Through one opening others are seen, so the
-    least justified are closed first.
+    so the images disagree more. What hangs together by a narrow neck only is judged in parts. Through one
+    opening others are seen, so the worst are closed first.
 
     Args:
         logits: (V,) opacity logits; surface where positive.
-        faces: (F, 3) of the template.
-        error: maps (V,) opaque or not to the image error through each vertex, (k, V) for several choices of
-            pixels, the first of which are all.
-        gain: an opening stays if the error through it is less than this fraction of the closed one's; small
-            ones need a better reason.
+        template: the mesh that is opened.
+        judge: of the fit.
 
     Returns:
-        (V,) logits, those of unjustified openings negated.
+        (V,) logits, those of rejected openings negated.
     """
+    faces = template[1]
     opened = logits <= 0
     if not opened.any():
         return logits
-    closed_error = error(np.ones_like(opened))
-    for closing in range(_CLOSINGS):
-        patch = _lobes(opened, faces)
-        ratios = _ratios(closed_error, error(~opened), patch)
-        small = np.bincount(patch) < _SMALL * len(opened)
-        # At a gain of 0 nothing is justified.
-        excess = np.where(small, ratios.max(axis=0) / _STRICTER, ratios[0]) / max(gain, 1e-30)
-        excess[np.bincount(patch, opened) == 0] = 0
-        if not (excess > 1).any():
+    if opened.all():
+        # Nothing at all explains no image.
+        return -logits
+    closed, kept = judge.shown(template), opened
+    for closing in reversed(range(_CLOSINGS)):
+        lobes = _lobes(kept, faces)
+        place = np.where(kept, np.unique(lobes, return_inverse=True)[1], -1)
+        verdict = judge.compare(closed, _shown(judge, template, ~kept, logits), (template, place))
+        if verdict.accepted[np.unique(place[kept])].all():
             break
         # At last there is no time for more.
-        worst = excess > (1 if closing == _CLOSINGS - 1 else max(1, _WORST * excess.max()))
-        opened &= ~worst[patch]
-    return np.where((logits <= 0) & ~opened, -logits, logits)
+        worst = ~verdict.accepted
+        if closing:
+            loss = np.where(worst, -verdict.gain, -np.inf)
+            worst &= loss >= _WORST * loss.max()
+        kept = kept & ~worst[place]
+        if not kept.any():
+            break
+    return np.where(opened & ~kept, -logits, logits)
 
 
-def open_rejected(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.ndarray], np.ndarray],
-                  gain: float) -> np.ndarray:
-    """Opens the islands in openings without which the images are explained about as well.
+def open_rejected(logits: np.ndarray, template: Mesh, judge: Judge) -> np.ndarray:
+    """Opens the islands in openings that unseen views do not speak for.
 
     A highlight on the inside of a bowl may be explained by a piece of the lid.
 
     Args:
-        logits, faces, error: as of ``close_rejected``.
-        gain: an island stays if the error with it is less than this fraction of that without.
+        logits, template, judge: as of ``close_rejected``.
 
     Returns:
-        (V,) logits, those of unjustified islands negated.
+        (V,) logits, those of rejected islands negated.
     """
+    faces = template[1]
     solid = logits > 0
     patch = equal_patches(solid, faces)
     part = vertex_components(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(logits))[1]
@@ -82,8 +75,16 @@ def open_rejected(logits: np.ndarray, faces: np.ndarray, error: Callable[[np.nda
     island = solid & (size < largest)
     if not island.any():
         return logits
-    ratio = _ratios(error(solid), error(solid & ~island), patch).max(axis=0)
-    return np.where(island & (gain * ratio[patch] < 1), -logits, logits)
+    place = np.where(island, np.unique(patch, return_inverse=True)[1], -1)
+    without, present = (_shown(judge, template, chosen, logits) for chosen in (solid & ~island, solid))
+    accepted = np.append(judge.compare(without, present, (template, place)).accepted, False)
+    return np.where(island & ~accepted[np.minimum(place, len(accepted) - 1)], -logits, logits)
+
+
+def _shown(judge: Judge, template: Mesh, solid: np.ndarray, logits: np.ndarray):
+    """The part of a template that is solid, its rims where the logits have them."""
+    vertices, faces = template
+    return judge.shown(positive_part(vertices, faces, np.where(solid, np.abs(logits), -np.abs(logits))))
 
 
 def _lobes(opened: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -103,9 +104,3 @@ def _lobes(opened: np.ndarray, faces: np.ndarray) -> np.ndarray:
             break
         np.maximum.at(lobe, here[front], lobe[there[front]])
     return np.where(opened, lobe, 1 + len(opened) + patch)
-
-
-def _ratios(before: np.ndarray, after: np.ndarray, patch: np.ndarray) -> np.ndarray:
-    """(k, P) factors by which (k, V) errors change in each patch."""
-    sums = [np.array([np.bincount(patch, values) for values in errors]) for errors in (before, after)]
-    return sums[1] / np.maximum(sums[0], 1e-30)

@@ -22,7 +22,7 @@ from ... import losses
 from ...activations import inverse_softplus, sigmoid, softplus
 from ...compat import mesh_scene, move_mesh
 from ...fields.smoothing import MeshDiffusion
-from ...pixels import COVERED, PixelPool, PixelSample
+from ...pixels import PixelPool, PixelSample
 from ...template.normals import vertex_normals
 from ...views import PinholeViews
 from ..bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
@@ -45,8 +45,8 @@ _NEGLIGIBLE = 1e-3
 #: Smoothed logits are limited to this.
 _LOGIT_LIMIT = 3.0
 
-#: Steps that adapt the radiance to a given opacity, and steps that then measure the image error.
-_REFIT_STEPS, _ERROR_STEPS = 40, 20
+#: Steps that adapt the radiance to a given opacity.
+_REFIT_STEPS = 40
 
 #: Refits of a radiance that has not learnt anything yet.
 _ROUNDS_FROM_GREY = 3
@@ -115,10 +115,9 @@ class SurfaceRadiance:
         self._set_opacity(np.where(opaque | opened, known, _INITIAL_LOGIT))
         self._opacity_rests = False
 
-    def refit_anew(self, opaque: np.ndarray, rounds: int = _ROUNDS_FROM_GREY) -> None:
-        """Fits the radiance as ``refit`` does, but from grey to where errors compare; in one round, to where
-        those do that differ by factors."""
-        for _ in range(rounds):
+    def refit_anew(self, opaque: np.ndarray) -> None:
+        """Fits the radiance as ``refit`` does, but from grey."""
+        for _ in range(_ROUNDS_FROM_GREY):
             self.refit(opaque)
 
     def refit(self, opaque: np.ndarray) -> None:
@@ -132,43 +131,6 @@ class SurfaceRadiance:
                 continue
             dr.backward(losses.l1(self.tone(radiance), self.tone(sample.radiance)))
             self.update(("radiance",), self.config.lr)
-
-    def image_error(self, opaque: np.ndarray) -> np.ndarray:
-        """How badly the images are explained through each vertex if just the vertices ``opaque`` are.
-
-        Returns:
-            (2, V) sums of the image error over random rays by the vertices of the *first* sheet that they
-            meet, whether that sheet is opaque or not: over all pixels, and over those that are wholly
-            covered. Sums for different opacities run over the same rays, hence they compare patch by patch.
-        """
-        self.refit(opaque)
-        sums = [dr.zeros(mi.Float, self.vertex_count) for _ in range(2)]
-        with dr.suspend_grad():
-            for step in range(_ERROR_STEPS):
-                sample, radiance, _, sheets = self.render(_EXTRA_STEP + _REFIT_STEPS + step)
-                difference = dr.abs(self.tone(radiance) - self.tone(sample.radiance))
-                if not sheets:
-                    continue
-                first = sheets[0]
-                error = dr.gather(mi.Float, difference.x + difference.y + difference.z, first.lane)
-                covered = dr.gather(mi.Float, sample.alpha, first.lane) > COVERED
-                for total, counts in zip(sums, (mi.Bool(True), covered), strict=True):
-                    for weight, corner in zip(first.weights, first.face, strict=True):
-                        dr.scatter_reduce(dr.ReduceOp.Add, total, weight * error, corner, counts)
-                dr.eval(sums)
-        return np.stack([total.numpy() for total in sums])
-
-    def unexplained(self, pixels: PixelPool) -> float:
-        """Mean image loss on other pixels than those that it was trained on."""
-        total = mi.Float(0)
-        with dr.suspend_grad():
-            for step in range(_ERROR_STEPS):
-                sample = pixels.sample(self.config.batch, seed=self.seed, step=step)
-                ray = self.views.rays(sample.view, sample.film)
-                radiance, _ = self.see(ray)
-                total += losses.log_l1(radiance, sample.radiance)
-                dr.eval(total)
-        return float(total[0]) / _ERROR_STEPS
 
     def move(self, positions: mi.Float) -> None:
         """Puts the vertices elsewhere: (3 V,) world positions, x0, y0, z0, x1, ..."""

@@ -24,9 +24,6 @@ from ..template import closed_template
 class CavitiesConfig:
     """Folds and hollows that the hull bridges."""
 
-    vessel_gain: float = 0.75
-    """Openings lead into the hollow of something solid, such as a mug, if a wall behind them brings the image
-    error through them below this fraction."""
     iterations: int = 1000
     """Steps of the fog; 0 leaves the hull as it is."""
     batch: Annotated[int, Between(1)] = 65536
@@ -35,9 +32,6 @@ class CavitiesConfig:
     """Adam's step for the density's logits; halves over the coarse steps, then falls tenfold."""
     radiance_lr: float = 0.05
     """Adam's step for the radiance, as a fraction of the targets' mean."""
-    opening_gain: float = 0.93
-    """An opening of what was carved stays if the image error through it is below this fraction of what it is
-    when closed."""
 
 
 class Cavities:
@@ -55,7 +49,7 @@ class Cavities:
         cubes = lattice.vertex_count == lattice.stride**3
         if cubes and not steps.done:
             with steps.task("walls"):
-                hollowed = hollowed_vessels(fit, surface, self.config.vessel_gain)
+                hollowed = hollowed_vessels(fit, surface)
             steps.fact("vessel", hollowed is not None)
             surface = hollowed or surface
         if cubes and count:

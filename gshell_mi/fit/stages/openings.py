@@ -19,7 +19,6 @@ import numpy as np
 
 from ... import losses
 from ...activations import sigmoid, softplus
-from ...errors import UserError
 from ...images import decibels
 from ...means import mean
 from ...pixels import FAINT
@@ -27,6 +26,7 @@ from ...schedules import decay_at
 from ...template.msdf import clean_opacity, msdf_from_template, splat_to_lattice
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
+from ..judge import Judge, Mesh
 from ..radiance.acceptance import close_rejected, open_rejected
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
@@ -56,8 +56,6 @@ class OpeningsConfig:
     """Final weight of the loss that closes what the images leave undecided."""
     chroma: float = 0.003
     """Weight of the tie between the chroma of a sheet's two sides."""
-    gain: float = 0.93
-    """An opening stays if the image error through it is below this fraction of what it is when closed."""
     rounds: int = 3
     """How often, at most, the steps are done again for what wrong openings have hidden."""
 
@@ -71,11 +69,7 @@ class Openings:
         self.config = config
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
-        """The surface with openings, and what was seen of it.
-
-        Raises:
-            UserError: nothing opaque was found.
-        """
+        """The surface with openings, and what was seen of it."""
         closed = surface.with_fields(msdf=np.ones_like(surface.fields.sdf))
         template = template_of(fit.scene.subject, closed)
         vertices, faces, count = template.vertices, template.faces, self.config.iterations
@@ -87,13 +81,12 @@ class Openings:
         with steps.task("verdict"):
             logits = np.ones(len(vertices))
             if not fit.config.watertight:
-                logits = find_openings(appearance, vertices, faces, self.config, fit.config.min_area,
+                logits = find_openings(appearance, template.closed, fit.judge, self.config.rounds,
+                                       partial(clean_opacity, vertices=vertices, faces=faces,
+                                               min_area=fit.config.min_area),
                                        lambda again: steps.repeat(training, count, again * count))
             opened = logits <= 0
             appearance.refit(~opened)
-        if opened.all():
-            raise UserError(f"There is nothing opaque in '{fit.scene.path}'; give the fit more steps with "
-                            f"--openings.iterations, or check the cameras.")
         front, _ = appearance.radiance()
         msdf = msdf_from_template(logits, template.mesh, surface.lattice)
         radiance, known = splat_to_lattice(mi.Float(front.ravel()), template.mesh, surface.lattice)
@@ -141,24 +134,22 @@ class OpacityTraining:
         return self.appearance.preview()
 
 
-def find_openings(appearance: SurfaceRadiance, vertices: np.ndarray, faces: np.ndarray,
-                  config: OpeningsConfig, min_area: float, train: Callable[[int], None]) -> np.ndarray:
+def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, rounds: int,
+                  clean: Callable[[np.ndarray], np.ndarray], train: Callable[[int], None]) -> np.ndarray:
     """Where the images justify an opening.
 
     Args:
         appearance: after its training; it is trained further.
-        vertices, faces: (V, 3) and (F, 3) of its template.
-        config: ``gain`` and ``rounds``.
-        min_area: cuts and islands that are undone, as of ``clean_opacity``.
+        template: the mesh that it is on.
+        judge: of the fit.
+        rounds: in which it is trained again, at most.
+        clean: undoes cuts and islands of (V,) logits that are too small, as ``clean_opacity`` does.
         train: does all steps of its training; told for which time, after the first, from 1.
 
     Returns:
         (V,) opacity logits, negative at openings.
     """
-    gain, clean = config.gain, partial(clean_opacity, vertices=vertices, faces=faces, min_area=min_area)
-    # At a gain of 0 nothing will be justified.
-    rounds = config.rounds if gain > 0 else 0
-    opened, unjustified = (np.zeros(len(vertices), bool) for _ in range(2))
+    opened, unjustified = (np.zeros(len(template[0]), bool) for _ in range(2))
     for trained_again in range(rounds + 1):
         if trained_again:
             appearance.begin_again(unjustified, opened)
@@ -166,8 +157,8 @@ def find_openings(appearance: SurfaceRadiance, vertices: np.ndarray, faces: np.n
         proposed = clean(appearance.smoothed_logits())
         proposed = np.where(opened, np.minimum(proposed, _OPEN), proposed)
         logits = proposed
-        for judge in (close_rejected, open_rejected):
-            logits = clean(judge(logits, faces, appearance.image_error, gain))
+        for without_rejected in (close_rejected, open_rejected):
+            logits = clean(without_rejected(logits, template, judge))
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
         unjustified |= (proposed <= 0) & (logits > 0)

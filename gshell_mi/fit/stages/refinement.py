@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...template.outlines import Outlines
+from ...triangles import positive_part
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..refinement.early_stopping import EarlyStopping
 from ..refinement.refinement import PhotometricRefinement
@@ -39,9 +40,6 @@ class RefinementConfig:
     """Adam's step for the radiance meanwhile."""
     outline: float = 0.001
     """Weight of the squared distance, in cells, between silhouettes and masks; falls to half."""
-    gain: float = 0.9
-    """It is kept if it brings the image error of views that it did not see below this fraction. Where
-    radiance depends much on the view (gloss), it may explain the views it sees by a wrong shape."""
     descent: float | None = None
     """It ends after a quarter of its steps unless the image error is below this fraction of what it was at
     first; default: it goes on."""
@@ -55,7 +53,6 @@ class FoldsConfig(RefinementConfig):
     lr: float = 0.3
     smoothing: float = 34.0
     detail: float = 11.0
-    gain: float = 0.97
     descent: float | None = 0.98
 
 
@@ -81,22 +78,25 @@ class Refinement:
         template = template_of(fit.scene.subject, surface)
         appearance = SurfaceRadiance(template.start, template.faces, fit.views, fit.training,
                                      fit.config.radiance, seed=fit.config.seed, glossy=True)
-        before = self._standing(appearance, template, fit) if self.first else surface.moved[0]
-        if not self.first:
-            appearance.take_over(before.positions, before.fitted, template.solid)
-        after = self._moved(appearance, template, before.positions, fit, steps, fit.cell(surface))
-        better = after is not None and after.error < self.config.gain * before.error
+        start = template.start
         if self.first:
-            return replace(surface, moved=(after,)) if better else surface
+            appearance.move(mi.Float(start.ravel()))
+            appearance.refit_anew(template.solid)
+        else:
+            start = surface.moved[0].positions
+            appearance.take_over(start, surface.moved[0].fitted, template.solid)
+        after = self._moved(appearance, template, start, fit, steps, fit.cell(surface))
         if after is None:
             return surface
-        return replace(surface, moved=(after, before) if better else (before, after))
-
-    def _standing(self, appearance: SurfaceRadiance, template: Template, fit: Fit) -> Moved:
-        """The template at rest, with a radiance fitted anew."""
-        appearance.move(mi.Float(template.start.ravel()))
-        appearance.refit_anew(template.solid)
-        return self._seen(appearance, template.start, fit)
+        with steps.task("verdict"):
+            meshes = (positive_part(at, template.faces, template.logits)
+                      for at in (start, after.positions))
+            verdict = fit.held_out_judge.decide(*meshes)
+        steps.fact(f"{self.name}_verdict", verdict.facts())
+        if self.first:
+            return replace(surface, moved=(after,)) if verdict.accepted[0] else surface
+        moved = (after, *surface.moved) if verdict.accepted[0] else (*surface.moved, after)
+        return replace(surface, moved=moved)
 
     def _moved(self, appearance: SurfaceRadiance, template: Template, positions: np.ndarray, fit: Fit,
                steps: Steps, cell: float) -> Moved | None:
@@ -115,12 +115,7 @@ class Refinement:
             run(watched, state=watched.state, stalled=watched.stalled)
             if watched.stalled(self.config.iterations):
                 return None
-        with steps.task("verdict"):
-            appearance.move(mi.Float(refinement.positions().ravel()))
-            appearance.refit(template.solid)
-            return self._seen(appearance, refinement.positions(), fit)
-
-    def _seen(self, appearance: SurfaceRadiance, positions: np.ndarray, fit: Fit) -> Moved:
-        radiance, _ = appearance.radiance()
-        error = appearance.unexplained(fit.held_out)
-        return Moved(self.name, positions, radiance, error, appearance.fitted())
+        positions = refinement.positions()
+        appearance.move(mi.Float(positions.ravel()))
+        appearance.refit(template.solid)
+        return Moved(self.name, positions, appearance.radiance()[0], appearance.fitted())

@@ -37,7 +37,7 @@ class Revoxelise:
         with steps.task():
             template = template_of(fit.scene.subject, surface)
             radiance = template.mesh.interpolate(mi.Float(surface.seen.radiance.ravel()), 3).numpy().T
-            still = Moved("start", template.start, radiance, np.inf)
+            still = Moved("start", template.start, radiance)
             found, taken = best_revoxelised(fit, template, (*surface.moved, still), surface.lattice,
                                             surface.seen.light)
             steps.fact("refinement_kept", taken not in ("start", ""))

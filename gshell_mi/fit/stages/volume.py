@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 
 import mitsuba as mi
@@ -10,7 +9,6 @@ import numpy as np
 import trimesh
 
 from ...fields.visual_hull import visual_hull
-from ..judge import judge
 from ..radiance.config import VolumeConfig
 from ..radiance.volume import RadianceVolume
 from ..radiance.volume_surface import volume_surface
@@ -38,7 +36,7 @@ class Volume:
             found = volume_surface(volume, fit.scene, lattice, advance)
             if found is None:
                 return surface
-            moved = Moved(self.name, found.positions, found.radiance, np.inf)
+            moved = Moved(self.name, found.positions, found.radiance)
             other, _ = best_revoxelised(fit, found.template, (moved,), lattice, surface.seen.light)
         if other is None:
             return surface
@@ -46,10 +44,10 @@ class Volume:
             # Its radiance may be as fine as that of the other.
             after = subject.surface_of(other.fields).to_numpy()[:2]
             before = _as_fine(before, fit.cell(other))
-            verdict = judge(before, after, fit.views, fit.scene.targets, fit.config)
-        steps.fact("volume", dataclasses.asdict(verdict))
-        steps.fact("volume_kept", verdict.accepted)
-        return without_unseen_parts(fit, other) if verdict.accepted else surface
+            verdict = fit.judge.decide(before, after)
+        steps.fact("volume", verdict.facts())
+        steps.fact("volume_kept", bool(verdict.accepted[0]))
+        return without_unseen_parts(fit, other) if verdict.accepted[0] else surface
 
     def _volume(self, fit: Fit, surface: tuple[np.ndarray, np.ndarray],
                 kept: Mapping[str, np.ndarray]) -> RadianceVolume:
