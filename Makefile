@@ -1,8 +1,8 @@
-# make fit    set everything up and reconstruct SCENE (default scenes/tshirt.xml) into OUT
-# make test   set everything up, check the style and run the tests
-# make regress fit every scene with default settings and compare with the stored results
-# make scenes rebuild the scenes from code
-# make fuzz   try damaged inputs of every kind, for ten minutes
+# make fit      set everything up and reconstruct SCENE (default scenes/tshirt.xml) into OUT
+# make test     set everything up, check the style and run the tests
+# make regress  fit every scene with default settings and compare with the stored results
+# make scenes   rebuild the scenes from code
+# make fuzz     try damaged inputs of every kind, for ten minutes
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c

@@ -1,5 +1,7 @@
 """Cameras of the captures that are made of scenes: camera-to-world matrices, axes right, up and backwards."""
 
+from __future__ import annotations
+
 import mitsuba as mi
 import numpy as np
 

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-from net import Net
 
 
 def pytest_addoption(parser):
@@ -15,7 +14,9 @@ def pytest_addoption(parser):
 
 
 @pytest.fixture(scope="session")
-def net(request) -> Net:
+def net(request):
     """The run over all cases."""
+    from net import Net  # needs a variant, which is not set when options are read
+
     option = request.config.getoption
     return Net(option("--fits").absolute(), option("--update"), option("--fresh"))
