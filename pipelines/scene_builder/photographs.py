@@ -88,8 +88,8 @@ def write_photographs(what: Photographs, folder: Path,
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"'{folder}' exists already; name a new folder.")
     if what.views < 4 or what.size < 16 or what.spp < 1 or what.seed < 0:
-        raise UserError("A capture takes at least 4 views of 16 pixels, 1 sample per pixel and a seed of 0 or "
-                        "more.")
+        raise UserError("A capture takes at least 4 views of 16 pixels, 1 sample per pixel and a seed "
+                        "of 0 or more.")
     subject = load_subject(what.reference)
     light = Path(what.reference).with_name("light.exr")
     if not light.is_file():
