@@ -4,7 +4,7 @@ Every function takes its own random numbers (``Dice``): switching one fault off 
 """
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy import ndimage
@@ -137,11 +137,6 @@ def wall(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
 def with_noise(encoded: np.ndarray, steps: float, rng: np.random.Generator) -> np.ndarray:
     """sRGB values with a sensor's noise of ``steps`` / 255."""
     return encoded + steps / 255 * rng.standard_normal(encoded.shape)
-
-
-def only(**sizes: float) -> Faults:
-    """The faults that are named, and no others."""
-    return replace(CLEAN, **sizes)
 
 
 def _smooth_noise(shape: tuple[int, int], scale: float, rng: np.random.Generator) -> np.ndarray:

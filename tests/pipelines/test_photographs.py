@@ -21,12 +21,17 @@ sys.path.insert(0, str(REPOSITORY / "pipelines"))
 
 import make_photographed_capture  # noqa: E402
 from scene_builder import faults as wrong  # noqa: E402
-from scene_builder.faults import CLEAN, Dice, Faults, only  # noqa: E402
+from scene_builder.faults import CLEAN, Dice, Faults  # noqa: E402
 from scene_builder.finish import finished, load_subject  # noqa: E402
 from scene_builder.photographs import Photographs, views_around, write_photographs  # noqa: E402
 
 REFERENCE = REPOSITORY / "scenes" / "skirt" / "reference.xml"
 VIEWS, SIZE = 8, 64
+
+
+def only(**sizes: float) -> Faults:
+    """The faults that are named, and no others."""
+    return dataclasses.replace(CLEAN, **sizes)
 
 
 @pytest.fixture(scope="module")
