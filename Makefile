@@ -1,7 +1,8 @@
-# make fit    set everything up and reconstruct SCENE (default scenes/tshirt.xml) into OUT
-# make test   set everything up, check the style and run the tests
-# make scenes rebuild the scenes from code
-# make fuzz   try damaged inputs of every kind, for ten minutes
+# make fit      set everything up and reconstruct SCENE (default scenes/tshirt.xml) into OUT
+# make test     set everything up, check the style and run the tests
+# make regress  fit every scene with default settings and compare with the stored results
+# make scenes   rebuild the scenes from code
+# make fuzz     try damaged inputs of every kind, for ten minutes
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -17,10 +18,10 @@ PY := $(VENV)/bin/python
 export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help fit test scenes fuzz clean
+.PHONY: help fit test regress scenes fuzz clean
 
 help:
-	@sed -n 's/^# //p' Makefile | head -4
+	@sed -n 's/^# //p' Makefile | head -5
 
 fit: $(VENV)/.llvm
 	@$(PY) -m gshell_mi.fit $(SCENE) -o $(OUT) --overwrite $(ARGS)
@@ -28,6 +29,9 @@ fit: $(VENV)/.llvm
 test: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) -m ruff check --quiet .
 	@$(PY) -m pytest $(ARGS)
+
+regress: $(VENV)/.test $(VENV)/.llvm
+	@$(PY) -m pytest tests/regression/fits.py -rs -s $(ARGS)
 
 scenes: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) pipelines/make_scenes.py $(ARGS)

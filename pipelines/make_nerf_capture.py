@@ -21,34 +21,13 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "pipelines"))
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
-from gshell_mi.images import srgb
+from scene_builder.cameras import TO_Z_UP, look_at, sensor  # noqa: E402
+
+from gshell_mi.images import srgb  # noqa: E402
 
 FOV = 42.0
-#: Ours are y up, Blender's z up.
-TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
-
-
-def cameras(directions: np.ndarray, distance: float) -> list[np.ndarray]:
-    """Camera-to-world matrices in our world, camera axes right, up, backwards."""
-    poses = []
-    for direction in directions:
-        right = np.cross([0.0, 1.0, 0.0], direction)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(direction, right), direction, distance * direction], 1)
-        poses.append(pose)
-    return poses
-
-
-def sensor(pose: np.ndarray, size: int) -> mi.Sensor:
-    # Mitsuba's camera has x to the left and looks along +z.
-    to_world = mi.ScalarTransform4f(pose @ np.diag([-1, 1, -1, 1]))
-    return mi.load_dict({"type": "perspective", "fov": FOV, "to_world": to_world,
-                         "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba",
-                                  "rfilter": {"type": "gaussian"}}})
 
 
 def to_png(image: np.ndarray, path: Path) -> None:
@@ -64,7 +43,7 @@ def write_split(scene: mi.Scene, folder: Path, split: str, poses: list[np.ndarra
     (folder / split).mkdir(parents=True, exist_ok=True)
     frames = []
     for index, pose in enumerate(poses):
-        image = mi.render(scene, sensor=sensor(pose, size), spp=spp, seed=index)
+        image = mi.render(scene, sensor=sensor(pose, FOV, size), spp=spp, seed=index)
         to_png(np.array(image), folder / split / f"r_{index}.png")
         frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": (TO_Z_UP @ pose).tolist()})
         print(f"\r{split}: {index + 1} / {len(poses)}", end="", file=sys.stderr, flush=True)
@@ -91,8 +70,8 @@ def main() -> None:
     radius = np.linalg.norm(np.maximum(np.abs(box.min), np.abs(box.max)))
     distance = 1.04 * radius / np.sin(np.radians(FOV / 2))
     for split, count, turn in (("train", arguments.views, 0.0), ("test", arguments.test_views, 1.0)):
-        write_split(scene, arguments.output, split, cameras(fibonacci_sphere(count, turn), distance),
-                    arguments.size, arguments.spp)
+        poses = [look_at(distance * direction, np.zeros(3)) for direction in fibonacci_sphere(count, turn)]
+        write_split(scene, arguments.output, split, poses, arguments.size, arguments.spp)
 
 
 if __name__ == "__main__":

@@ -20,9 +20,11 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
-from gshell_mi.images import srgb
+from scene_builder.cameras import look_at, sensor  # noqa: E402
+
+from gshell_mi.images import srgb  # noqa: E402
 
 FOV = 40.0
 #: Degrees that the camera looks down, at its lowest and highest.
@@ -52,17 +54,13 @@ def furnished(reference: Path) -> mi.Scene:
                   "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": cloth}}}})
 
 
-def sensor(turn: float, target: np.ndarray, distance: float, size: int) -> mi.Sensor:
+def pose(turn: float, target: np.ndarray, distance: float) -> np.ndarray:
     low, high = np.radians(ELEVATIONS)
     azimuth = 2 * np.pi * turn
     elevation = low + (high - low) * (0.5 - 0.5 * np.cos(3 * azimuth))
     direction = np.array([np.cos(elevation) * np.sin(azimuth), np.sin(elevation),
                           np.cos(elevation) * np.cos(azimuth)])
-    to_world = mi.ScalarTransform4f().look_at(origin=target + distance * direction, target=target,
-                                              up=[0, 1, 0])
-    return mi.load_dict({"type": "perspective", "fov": FOV, "to_world": to_world,
-                         "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba",
-                                  "rfilter": {"type": "gaussian"}}})
+    return look_at(target + distance * direction, target)
 
 
 def main() -> None:
@@ -86,7 +84,7 @@ def main() -> None:
     video = imageio_ffmpeg.write_frames(str(arguments.output), size, fps=24, codec="libx264", quality=8)
     video.send(None)
     for index in range(arguments.frames):
-        camera = sensor(index / arguments.frames, target, distance, arguments.size)
+        camera = sensor(pose(index / arguments.frames, target, distance), FOV, arguments.size)
         image = np.array(mi.render(scene, sensor=camera, spp=arguments.spp, seed=index))[..., :3]
         video.send((srgb(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8).tobytes())
         alpha = np.array(mi.render(alone, sensor=camera, spp=8, seed=index))[..., 3]

@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
+from .expectations import FIGURES
 from .trials import Outcome
 
-#: Heading and what it shows of the scores.
-_COLUMNS = {
-    "loops": lambda s: _of(s["mesh"]["boundary_loops"]),
-    "pin-holes": lambda s: str(s["mesh"]["pinholes"]["found"]),
-    "components": lambda s: _of(s["mesh"]["components"]),
-    "non-manifold": lambda s: str(s["mesh"]["nonmanifold_edges"]["found"]),
-    "rim": lambda s: _ratio(s["mesh"]["boundary_length"]),
-    "chamfer %": lambda s: f"{s['mesh']['chamfer']:.3f}",
-    "F-score": lambda s: f"{s['mesh']['f_score']:.3f}",
-    "novel dB": lambda s: f"{s['mean']['psnr']:.2f}",
-    "mask IoU": lambda s: f"{s['mean']['mask_iou']:.4f}",
-}
+#: Figures that are shown with the truth's.
+_OF_THE_TRUTH = ("boundary_loops", "components")
 
 LEGEND = """\
 Loops and components are *found / true*; a boundary shorter than 5 % of the diagonal is a pin-hole and no
@@ -33,7 +24,7 @@ def table(rows: list[tuple[str | None, str, Outcome | None]], first: str) -> str
     """
     code = next((outcome.code for _, _, outcome in rows if outcome), None)
     marked = False
-    names = list(_COLUMNS)
+    names = [figure.title for figure in FIGURES.values()]
     lines = [f"| {first} | {' | '.join(names)} | CPU s |", "|---" * (len(names) + 2) + "|"]
     shown = None
     for group, label, outcome in rows:
@@ -53,14 +44,14 @@ def table(rows: list[tuple[str | None, str, Outcome | None]], first: str) -> str
 def _cells(outcome: Outcome) -> list[str]:
     if outcome.error:
         reason = outcome.error.split(" in '")[0]
-        return [f"failed: {reason}"] + [""] * len(_COLUMNS)
+        return [f"failed: {reason}"] + [""] * len(FIGURES)
     seconds = "-" if outcome.cpu_seconds is None else f"{outcome.cpu_seconds:.0f}"
-    return [show(outcome.scores) for show in _COLUMNS.values()] + [seconds]
+    return [_cell(name, outcome.scores) for name in FIGURES] + [seconds]
 
 
-def _of(count: dict) -> str:
-    return f"{count['found']} / {count['reference']}"
-
-
-def _ratio(length: dict) -> str:
-    return f"{length['found'] / length['reference']:.2f}" if length["reference"] else "-"
+def _cell(name: str, scores: dict) -> str:
+    if name in _OF_THE_TRUTH:
+        count = scores["mesh"][name]
+        return f"{count['found']} / {count['reference']}"
+    figure = FIGURES[name]
+    return figure.text(figure.read(scores))

@@ -25,11 +25,17 @@ from gshell_mi.scene import render_missing_targets
 
 @dataclass(frozen=True)
 class Trial:
-    """A fit to make and to score; the scene's folder holds ``truth.ply``, ``test.xml``, ``reference.xml``."""
+    """A fit to make and to score."""
 
     scene: Path
     name: str
     config: FitConfig
+    truth: Path | None = None
+    """The folder that holds ``truth.ply``, ``test.xml`` and ``reference.xml``; default: the scene's."""
+
+    @property
+    def truth_folder(self) -> Path:
+        return self.truth or self.scene.with_suffix("")
 
     def record(self, output: Path) -> Path:
         """The file that holds its outcome."""
@@ -76,19 +82,22 @@ def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
     """
     if is_done(trial, output):
         return load_outcome(trial, output)
-    inside = trial.scene.with_suffix("")
+    inside = trial.truth_folder
     for needed in (inside / "truth.ply", inside / "test.xml", inside / "reference.xml"):
         if not needed.is_file():
             raise UserError(f"'{needed}' is missing; a scene of a study needs it to be scored.")
     folder = output / trial.scene.stem / trial.name
     resume = _same_settings(folder / "checkpoint.npz", trial.config)
-    _render_views(inside / "reference.xml", trial.scene, inside)
+    if trial.truth is None:
+        _render_views(inside / "reference.xml", trial.scene, inside)
     code, before = code_version(), time.process_time()
     try:
         fitted = fit_scene(trial.scene, folder, config=trial.config, resume=resume, overwrite=not resume,
                            report=False, quiet=quiet)
         seconds = time.process_time() - before
-        targets = output / trial.scene.stem / "test_views"
+        targets = inside / "test"
+        if not targets.is_dir():
+            targets = output / trial.scene.stem / "test_views"
         _render_views(inside / "reference.xml", inside / "test.xml", targets)
         scores = compare_fit(folder, targets=targets, sensors=inside / "test.xml", mesh=inside / "truth.ply")
         outcome = Outcome(_plain(trial.config), {"mean": scores["mean"], "mesh": scores["mesh"]},

@@ -64,6 +64,17 @@ def sensor_xml(name: str, origin: np.ndarray) -> str:
 """
 
 
+def test_xml(distance: float, lowest: float = -1.0) -> str:
+    """The document of twelve sensors that no fit sees, spread above y = ``lowest`` of the unit sphere."""
+    directions = fibonacci_sphere(12, 1.0, lowest)
+    return scene_xml(*(sensor_xml(f"test_{i:03}", distance * d) for i, d in enumerate(directions)), spp=256)
+
+
+def whole_view_distance(vertices: np.ndarray, fov: float) -> float:
+    """How far from the origin a camera sees all vertices (n, 3), with a margin; ``fov`` in degrees."""
+    return 1.04 * np.linalg.norm(vertices, axis=1).max() / np.sin(np.radians(fov / 2))
+
+
 def scene_xml(*parts: str, spp: int | None = None) -> str:
     """A scene document; ``spp`` sets the default of the sensors' ``$spp``."""
     default = "" if spp is None else f'    <default name="spp" value="{spp}"/>\n'
@@ -80,15 +91,14 @@ def write_scene(name: str, item: SceneObject, folder: Path) -> None:
     for stale in inside.glob("view_*.exr"):
         stale.unlink()
     vertices = centred(item.mesh)
-    distance = 1.04 * np.linalg.norm(vertices, axis=1).max() / np.sin(np.radians(FOV / 2))
-
+    distance = whole_view_distance(vertices, FOV)
     around = partial(fibonacci_sphere, lowest=item.lowest_view)
 
     def sensors(prefix: str, directions: np.ndarray) -> list[str]:
         return [sensor_xml(f"{prefix}_{i:03}", distance * d) for i, d in enumerate(directions)]
 
     (inside / "sensors.xml").write_text(scene_xml(*sensors("view", around(item.views))))
-    (inside / "test.xml").write_text(scene_xml(*sensors("test", around(12, turn=1.0)), spp=256))
+    (inside / "test.xml").write_text(test_xml(distance, item.lowest_view))
     (folder / f"{name}.xml").write_text(scene_xml(
         f"""    <!-- The unknown: fills the cube [-1, 1]^3. -->
     <shape type="gshell" id="subject">
@@ -98,7 +108,16 @@ def write_scene(name: str, item: SceneObject, folder: Path) -> None:
     <emitter type="constant" id="light"> <rgb name="radiance" value="0.5"/> </emitter>
     <include filename="{name}/sensors.xml"/>
 """, spp=16))
-    (inside / "reference.xml").write_text(scene_xml(
+    (inside / "reference.xml").write_text(reference_xml(
+        item.roughness, item.metallic, '    <include filename="sensors.xml"/>\n'))
+    write_ply(inside / "truth.ply", vertices, item.mesh.faces, item.color)
+    light = mi.Bitmap(np.ascontiguousarray(item.light, dtype=np.float32))
+    light.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float16, False).write(str(inside / "light.exr"))
+
+
+def reference_xml(roughness: float, metallic: float, *parts: str) -> str:
+    """The document of the truth: ``truth.ply`` with the colours of its vertices under ``light.exr``."""
+    return scene_xml(
         f"""    <!-- The truth that the targets are rendered from; the fit never sees it. -->
     <integrator type="path">
         <integer name="max_depth" value="6"/> <boolean name="hide_emitters" value="true"/>
@@ -109,16 +128,12 @@ def write_scene(name: str, item: SceneObject, folder: Path) -> None:
             <texture type="mesh_attribute" name="base_color">
                 <string name="name" value="vertex_color"/>
             </texture>
-            <float name="roughness" value="{item.roughness:g}"/>
-            <float name="metallic" value="{item.metallic:g}"/>
+            <float name="roughness" value="{roughness:g}"/>
+            <float name="metallic" value="{metallic:g}"/>
         </bsdf> </bsdf>
     </shape>
     <emitter type="envmap" id="light"> <string name="filename" value="light.exr"/> </emitter>
-    <include filename="sensors.xml"/>
-""", spp=256))
-    write_ply(inside / "truth.ply", vertices, item.mesh.faces, item.color)
-    light = mi.Bitmap(np.ascontiguousarray(item.light, dtype=np.float32))
-    light.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float16, False).write(str(inside / "light.exr"))
+""", *parts, spp=256)
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, color: np.ndarray) -> None:

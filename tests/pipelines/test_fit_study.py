@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+import shutil
 import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from bowl import CLOSED, SHORT, sensors_xml, write_scene
@@ -172,6 +174,22 @@ def test_a_fit_that_fails_is_told(scene, tmp_path, monkeypatch, capsys):
     ((_, found),) = run_trials([Trial(scene, "default", FitConfig())], tmp_path)
     assert found.error == "There is nothing opaque."
     assert "default: failed: There is nothing opaque." in capsys.readouterr().out
+
+
+def test_truth_may_lie_elsewhere(scene, tmp_path, monkeypatch):
+    truth, bare = tmp_path / "truth", tmp_path / "bare.xml"
+    shutil.copytree(scene.with_suffix(""), truth)
+    shutil.copyfile(scene, bare)
+    (truth / "test").mkdir()
+    for number in range(2):
+        (truth / "test" / f"test_{number:03}.exr").touch()
+    called, fitted = {}, SimpleNamespace(metrics={"seconds": {"total": 1.0}})
+    monkeypatch.setattr(trials, "fit_scene", lambda *_, **__: fitted)
+    monkeypatch.setattr(trials, "compare_fit", lambda _, **given: called.update(given) or outcome().scores)
+    found = run_trial(Trial(bare, "default", FitConfig(), truth=truth), tmp_path / "fits")
+    assert found.error is None and found.scores["mesh"]["chamfer"] == 0.1234
+    assert called == {"targets": truth / "test", "sensors": truth / "test.xml", "mesh": truth / "truth.ply"}
+    assert not bare.with_suffix("").exists(), "targets are what the scene has, not what the truth could give"
 
 
 def test_scene_without_truth(tmp_path, capsys):
