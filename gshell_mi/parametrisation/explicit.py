@@ -57,8 +57,8 @@ class ExplicitGrid(Parametrisation):
     def carry(self, carried: Carried) -> None:
         for optimizer in self.optimizers.values():
             carried.optimizer(optimizer, tuple(optimizer.keys()))
-        if self.held is not None:
-            self.held = carried.moments(self.held)
+        if self.frozen is not None:
+            self.frozen = carried.moments(self.frozen)
         self.lattice = carried.after
 
     def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
@@ -73,16 +73,16 @@ class ExplicitGrid(Parametrisation):
         steps = {name: trusted(gradient) for name, gradient in gradients.items()}
         steps |= diffuse.together({name: steps[name] for name in steps if name in CHANNELS}, smoothing)
         before = self.fields()
-        if self.held is not None:
+        if self.frozen is not None:
             # No momentum gathers meanwhile.
-            steps["msdf"] = dr.select(self.held, 0, steps["msdf"])
+            steps["msdf"] = dr.select(self.frozen, 0, steps["msdf"])
         for name, gradient in steps.items():
             dr.set_grad(self._optimizer_of(name)[name], gradient)
         for optimizer in self.optimizers.values():
             optimizer.set_learning_rate({name: decay * rates[name] for name in optimizer.keys()})
             optimizer.step()
-        if self.held is not None:
-            self.msdf_optimizer["msdf"] = dr.select(self.held, before["msdf"], self.msdf_optimizer["msdf"])
+        if self.frozen is not None:
+            self.msdf_optimizer["msdf"] = dr.select(self.frozen, before["msdf"], self.msdf_optimizer["msdf"])
         if "deform" in gradients:
             self.optimizer["deform"] = dr.clip(self.optimizer["deform"], -1, 1)
 

@@ -54,7 +54,7 @@ class Parametrisation(ABC):
     moves_weights: bool = False
     """Whether the weights of FlexiCubes are among the fields that it is given in a fit."""
 
-    held: mi.Bool | None = None
+    frozen: mi.Bool | None = None
     """Lattice vertices where the mSDF stays as it is; None for none. Heeded where ``replace`` is."""
 
     @property

@@ -35,7 +35,7 @@ _CUT_OFF = 0.1
 #: Where there is no opening, a part is a sheet only if one side of it is this fraction of it.
 _SHEET_SHARE = 0.35
 
-#: Lambda that smooths the new rims along the mesh, and how spare sides are carried along.
+#: Lambda that smooths the new rims along the mesh, and how redundant sides are carried along.
 _SMOOTHING = 3.0
 
 #: Size, at least, of the logits of both sides where one stays.
@@ -82,14 +82,15 @@ def collapsed_sheets(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: floa
     solid = cut.logits > 0
     thickness, opposite = opposite_sides(before, cut.positions, faces, cell)
     normals, smooth = normals_at_vertices(before, faces), MeshDiffusion(faces, len(solid), _SMOOTHING)
-    spare, sheets = spare_sides(thickness, opposite, normals, faces, solid, smooth, cell, sheet_thickness)
-    small, count = small_sheets(cut.positions, normals, faces, ~solid | spare, sheet_thickness * cell)
-    spare, sheets = spare | small, sheets + count
-    if not spare.any():
+    redundant, sheets = redundant_sides(thickness, opposite, normals, faces, solid, smooth, cell,
+                                        sheet_thickness)
+    small, count = small_sheets(cut.positions, normals, faces, ~solid | redundant, sheet_thickness * cell)
+    redundant, sheets = redundant | small, sheets + count
+    if not redundant.any():
         return None
-    logits, _ = reopened(cut.logits, ~solid | spare, smooth)
-    logits[spare] = np.minimum(logits[spare], -_LEAST)
-    stays = solid & ~spare & np.isfinite(thickness) & (spare | ~solid)[opposite]
+    logits, _ = reopened(cut.logits, ~solid | redundant, smooth)
+    logits[redundant] = np.minimum(logits[redundant], -_LEAST)
+    stays = solid & ~redundant & np.isfinite(thickness) & (redundant | ~solid)[opposite]
     logits[stays] = np.maximum(logits[stays], _LEAST)
     logits = clean_opacity(logits, before, faces, min_area)
     left = topology(*positive_part(before, faces, logits))
@@ -97,13 +98,13 @@ def collapsed_sheets(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: floa
         return None
     thickness, opposite = opposite_sides(before, before, faces, cell)
     opposite = np.where(np.isfinite(thickness), opposite, -1)
-    return Cut(logits, carried(before, cut.positions, spare, opposite, smooth), left,
+    return Cut(logits, carried(before, cut.positions, redundant, opposite, smooth), left,
                min(cut.fewest_loops + sheets, left.boundary_loops))
 
 
-def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray, faces: np.ndarray,
-                solid: np.ndarray, smooth: MeshDiffusion, cell: float,
-                sheet_thickness: float) -> tuple[np.ndarray, int]:
+def redundant_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray, faces: np.ndarray,
+                    solid: np.ndarray, smooth: MeshDiffusion, cell: float,
+                    sheet_thickness: float) -> tuple[np.ndarray, int]:
     """Sides of thin parts that may go: those beside openings, and one of a part that is nothing but a sheet.
 
     Args:
@@ -129,12 +130,12 @@ def spare_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray
     opened |= _cut_off(opened, solid, edges)
     # Where a sheet is narrow its rims are near, and smoothing them must not change what stays between them.
     decided = np.isfinite(thickness) & (opened | opened[opposite])
-    spare = solid & np.where(decided, opened, _balanced(opened, thin, opposite, edges, smooth) < 0)
+    redundant = solid & np.where(decided, opened, _balanced(opened, thin, opposite, edges, smooth) < 0)
     # A fin of something solid is no sheet, nor is a plate, whose sides stay apart.
-    share = np.bincount(part, spare) / np.maximum(np.bincount(part, solid), 1)
+    share = np.bincount(part, redundant) / np.maximum(np.bincount(part, solid), 1)
     sheets = [index for index in np.unique(part[candidates]) if share[index] > _SHEET_SHARE
               and np.median(thickness[candidates[part[candidates] == index]]) < sheet_thickness * cell]
-    return spare & (~closed | np.isin(part, sheets)), len(sheets)
+    return redundant & (~closed | np.isin(part, sheets)), len(sheets)
 
 
 def _one_side(thin: np.ndarray, normals: np.ndarray, edges: np.ndarray, part: np.ndarray) -> np.ndarray:
@@ -196,24 +197,24 @@ def _balanced(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges:
     return result
 
 
-def carried(before: np.ndarray, moved: np.ndarray, spare: np.ndarray, opposite: np.ndarray,
+def carried(before: np.ndarray, moved: np.ndarray, redundant: np.ndarray, opposite: np.ndarray,
             smooth: MeshDiffusion) -> np.ndarray:
-    """(V, 3) positions in which spare sides go where the sides that stay go.
+    """(V, 3) positions in which redundant sides go where the sides that stay go.
 
     Alone they would end up in the other side or beyond: nothing keeps what the images hardly tell apart.
 
     Args:
         before, moved: (V, 3) positions.
-        spare: (V,) vertices that are open now.
+        redundant: (V,) vertices that are open now.
         opposite: (V,) vertex on the other side; negative if there is none.
         smooth: spreads values to vertices that have no other side.
     """
-    known = ~spare | (opposite >= 0) & ~spare[opposite]
-    movement = np.where(spare[:, None], moved[opposite] - before[opposite], moved - before)
+    known = ~redundant | (opposite >= 0) & ~redundant[opposite]
+    movement = np.where(redundant[:, None], moved[opposite] - before[opposite], moved - before)
     movement[~known] = 0
     columns = [smooth(mi.Float(column.astype(np.float32))).numpy() for column in (known, *movement.T)]
     spread = np.stack(columns[1:], axis=1) / np.maximum(columns[0], 1e-6)[:, None]
-    return np.where(spare[:, None], before + spread, moved)
+    return np.where(redundant[:, None], before + spread, moved)
 
 
 def _beside(chosen: np.ndarray, edges: np.ndarray) -> np.ndarray:

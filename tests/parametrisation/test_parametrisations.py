@@ -146,13 +146,13 @@ def test_what_is_held_stays_until_it_is_let_go():
     pull = {name: dr.full(mi.Float, 1, dr.width(field)) for name, field in made.fields().items()}
     made.step(pull, 0.0)    # momentum, too, leads nowhere
     before, below = made.fields(), lattice.vertex_positions()[:, 2] < 0
-    made.held = mi.Bool(below)
+    made.frozen = mi.Bool(below)
     for _ in range(3):
         made.step(pull, 0.0)
     moved = {name: made.fields()[name].numpy() - field.numpy() for name, field in before.items()}
     np.testing.assert_array_equal(moved["msdf"] == 0, below)
     assert (moved["sdf"] < 0).all()
-    made.held = None
+    made.frozen = None
     made.step(pull, 0.0)
     assert (made.fields()["msdf"].numpy() < msdf).all()
 
@@ -162,12 +162,12 @@ def test_what_is_held_is_carried_to_other_blocks():
     before, after = (BlockLattice.around(lattice, lambda p, r=radius: dr.norm(p) - r, mi.Float)
                      for radius in (0.3, 0.6))
     made = make_parametrisation("explicit", bowl(before), before)
-    made.held = before.points(mi.Float).z < 0
+    made.frozen = before.points(mi.Float).z < 0
     made.carry(Carried(before, after))
-    held, below = made.held.numpy(), after.points(mi.Float).numpy()[2] < 0
+    frozen, below = made.frozen.numpy(), after.points(mi.Float).numpy()[2] < 0
     stored = after.find_in(before).numpy() != MISSING
-    np.testing.assert_array_equal(held, below & stored)
-    assert 0 < held.sum() < below.sum()
+    np.testing.assert_array_equal(frozen, below & stored)
+    assert 0 < frozen.sum() < below.sum()
 
 
 def test_broken_gradients_are_left_out():

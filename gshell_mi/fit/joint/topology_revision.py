@@ -1,8 +1,8 @@
-"""Openings get a second look once light and material are known.
+"""Openings are revised once light and material are known.
 
-Openings are found before anything is known of the light. A cap that lies right behind a rim, such as at
-the end of a garment's pleat, it may leave: the radiance that it fits to a cap explains the few views that see
-in as well as the one that it fits to the dark inside. A path tracer knows how dark that is. So it is asked
+They are found before anything is known of the light. A cap that lies right behind a rim, such as at the end
+of a garment's pleat, may be left: the radiance that is fitted to a cap explains the few views that see in as
+well as the one that is fitted to the dark inside. A path tracer knows how dark that is. So it is asked
 what would be seen without the surface beside an opening. Where that is about as good without anything having
 been fitted to it, the opening grows. And a small opening through which nothing looks like the images, such as
 one found in a bulge of the hull, is shut. After further steps each place is judged: it stays as it is
@@ -90,8 +90,8 @@ class TopologyRevision:
         if not joint.geometry.is_explicit or joint.config.watertight or self._judges >= count:
             self._changes = count     # never
         self._state = dict(state)
-        if (held := self._state.pop("held", None)) is not None:
-            joint.geometry.held = mi.Bool(held)
+        if (frozen := self._state.pop("frozen", None)) is not None:
+            joint.geometry.frozen = mi.Bool(frozen)
 
     def step(self, iteration: int) -> Mapping[str, float]:
         """One step of the joint stage, after what is to be done before it."""
@@ -107,8 +107,8 @@ class TopologyRevision:
 
     def state(self) -> dict[str, np.ndarray]:
         """What a checkpoint keeps, so that a fit that goes on judges alike."""
-        held = self.joint.geometry.held
-        return self._state | ({} if held is None else {"held": held.numpy()})
+        frozen = self.joint.geometry.frozen
+        return self._state | ({} if frozen is None else {"frozen": frozen.numpy()})
 
     def finish(self) -> bool | None:
         """Ends the joint stage; returns whether openings have changed for good, None if none was doubted.
@@ -172,7 +172,7 @@ class TopologyRevision:
         changed, near = reopened(values, (before | grows) & ~shut, smooth, self._scale)
         former = self._msdf()
         msdf = self._write(template, changed, near)
-        self.joint.geometry.held = (msdf < -_CORE * self._scale) & (msdf != former)
+        self.joint.geometry.frozen = (msdf < -_CORE * self._scale) & (msdf != former)
         patch = np.full(len(vertices), -1)
         place = equal_patches(np.where(grows, 1, np.where(shut, 2, 0)), faces)
         patch[grows | shut] = np.unique(place[grows | shut], return_inverse=True)[1]
@@ -193,7 +193,7 @@ class TopologyRevision:
         # All of the surface has been explained better since.
         ratio = now[:-1] / then[:-1] * (then[-1] / now[-1])
         unjustified = ratio >= self.joint.stage.revision_gain
-        self.joint.geometry.held = None
+        self.joint.geometry.frozen = None
         self._undo(unjustified)
         self._state["kept"] = ~unjustified
         self._open_sheets(~unjustified)

@@ -57,7 +57,8 @@ class StillJoint:
         self.subject.set_fields(replace(fields, msdf=(0.45 - fields.lattice.vertex_positions()[:, 2])
                                         .astype(np.float32)))
         self._msdf = self.subject.msdf
-        self.geometry = SimpleNamespace(replace=self._replace, held=None, is_explicit=True)
+        self.geometry = SimpleNamespace(replace=self._replace, frozen=None,
+                                        is_explicit=config.model.field == "explicit")
         self.scene = self.integrator = None
 
     def _replace(self, name, field):
@@ -142,20 +143,20 @@ def test_what_has_grown_rests_until_it_is_judged(evidence_above):
     evidence_above["later"] = 0.5
     joint = StillJoint(CONFIG)
     worker = run(joint, range(1))
-    held, msdf = joint.geometry.held.numpy(), joint.subject.msdf.numpy()
+    frozen, msdf = joint.geometry.frozen.numpy(), joint.subject.msdf.numpy()
     z = LATTICE.vertex_positions()[:, 2]
     opened = (msdf < 0) & (z < 0.45) & (np.abs(joint.subject.fields().sdf) < 0.5 * LATTICE.spacing)
     rim = opened & (z < 0.35)
-    assert held[opened & ~rim].all() and (opened & ~rim).sum() > 40
-    assert 0 < (held & rim).sum() < 0.3 * rim.sum()
-    assert (msdf[held] < 0).all()
+    assert frozen[opened & ~rim].all() and (opened & ~rim).sum() > 40
+    assert 0 < (frozen & rim).sum() < 0.3 * rim.sum()
+    assert (msdf[frozen] < 0).all()
 
-    joint.geometry.held, state = None, worker.state()
+    joint.geometry.frozen, state = None, worker.state()
     worker = run(joint, range(1, 4), state)
-    np.testing.assert_array_equal(joint.geometry.held.numpy(), held)
-    np.testing.assert_array_equal(worker.state()["held"], held)
+    np.testing.assert_array_equal(joint.geometry.frozen.numpy(), frozen)
+    np.testing.assert_array_equal(worker.state()["frozen"], frozen)
     worker = run(joint, range(4, 5), worker.state())
-    assert joint.geometry.held is None and "held" not in worker.state()
+    assert joint.geometry.frozen is None and "frozen" not in worker.state()
 
 
 def test_specks_grow_with_the_opening_that_they_belong_to(evidence_above):
@@ -312,7 +313,7 @@ def test_a_loose_sheet_has_one_side(evidence_above, monkeypatch, thickness, loop
     assert run(joint, range(8)).finish() is (True if grows else None)
     assert joint.loops() == loops
     assert (joint.height() < 0.3) == grows
-    assert joint.geometry.held is None
+    assert joint.geometry.frozen is None
 
 
 @pytest.mark.parametrize("thickness", [0.6, 1.0])
@@ -354,10 +355,10 @@ def test_a_loose_sheet_that_closes_opens_in_the_end(evidence_above, monkeypatch,
     assert found.boundary_length > 1.3 * 2 * np.pi * RADIUS
 
 
-@pytest.mark.parametrize("settings", [{"topology_revision": 1.0}, {"watertight": True}, {"field": "hashgrid"},
-                                      {"iterations": 1}])
+@pytest.mark.parametrize("settings", [{"joint.revision": 1.0}, {"watertight": True},
+                                      {"model.field": "hashgrid"}, {"iterations": 1}])
 def test_modes_without_it(evidence_above, settings):
-    joint = StillJoint(replace(CONFIG, **settings))
+    joint = StillJoint(CONFIG.changed(settings))
     worker = run(joint, range(joint.config.iterations))
     assert worker.finish() is None and not worker.state()
     assert joint.height() == pytest.approx(0.45, abs=LATTICE.spacing)
