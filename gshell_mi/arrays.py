@@ -19,6 +19,8 @@ Bool: TypeAlias = AnyArray
 """One truth value per entry."""
 UInt32: TypeAlias = AnyArray
 """One unsigned number of 32 bits per entry: an id, an index, a count or a set of bits."""
+UInt64: TypeAlias = AnyArray
+"""The same of 64 bits."""
 Float: TypeAlias = AnyArray
 """One single-precision number per entry."""
 Array3f: TypeAlias = AnyArray

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arrays import ArrayT
 from .compat import mesh_scene
 from .topology import topology, vertex_components
 from .triangles import area_vectors, unit
@@ -126,5 +127,5 @@ def _touching(centers: np.ndarray, normals: np.ndarray, template: tuple[np.ndarr
     return touching
 
 
-def _vectors(kind: type, rows: np.ndarray):
+def _vectors(kind: type[ArrayT], rows: np.ndarray) -> ArrayT:
     return kind(np.ascontiguousarray(rows.T, np.float32))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .activations import sigmoid
 from .fields.carried import Carried
@@ -120,7 +121,7 @@ def principled(base_color: mi.Texture | None = None) -> dict:
     return {"type": "twosided", "bsdf": {"type": "principled", **textures}}
 
 
-def _logit(x):
+def _logit(x: ArrayLike) -> np.ndarray:
     # Saturated values would have no gradient left.
     x = np.clip(x, 0.02, 0.98)
     return np.log(x / (1 - x))

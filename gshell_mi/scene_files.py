@@ -9,7 +9,7 @@ Mitsuba's own folder in front. See docs/security.md.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from xml.parsers import expat
@@ -84,7 +84,8 @@ class _Enough(Exception):
     """What is looked for has been found."""
 
 
-def _parse(path: Path, started, ended=None) -> None:
+def _parse(path: Path, started: Callable[[str, dict[str, str]], None],
+           ended: Callable[[str], None] | None = None) -> None:
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = started, ended
     parser.Parse(path.read_bytes(), True)

@@ -1,13 +1,15 @@
 """The ``gshell`` shape plugin: a Mitsuba mesh that is extracted from fields on a lattice."""
 
+from __future__ import annotations
+
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from . import compat, memory
+from .arrays import ArrayT
 from .conversion import from_mesh
 from .errors import UserError
 from .extraction import SurfaceMesh, extract
@@ -92,7 +94,7 @@ class GShell(mi.Mesh):
         band = props.get("band", False)
         self.to_world = compat.to_world(props)
         compat.init_mesh(self, props, has_vertex_normals=smooth)
-        self._attributes: dict[str, tuple[Any, int]] = {}
+        self._attributes: dict[str, tuple[mi.Float, int]] = {}
         self._mirrored = bool(np.linalg.det(np.array(self.to_world.matrix)[:3, :3]) < 0)
         self.set_fields(_initial_fields(self.filename, grid, resolution, self.to_world, band))
         # Mitsuba merges the meshes of a scene that have equal materials into plain ones, but for those with
@@ -118,7 +120,7 @@ class GShell(mi.Mesh):
         else:
             super().parameters_changed(keys)
 
-    def attach_attribute(self, name: str, field: Any) -> None:
+    def attach_attribute(self, name: str, field: mi.Float) -> None:
         """Gives the mesh a vertex attribute that is interpolated from a lattice field.
 
         The field appears in ``mi.traverse`` as ``lattice_<name>`` and a ``mesh_attribute`` texture reads
@@ -233,7 +235,7 @@ class GShell(mi.Mesh):
         """The parameters that make the surface: ``weights`` are among them with FlexiCubes only."""
         return _FIELDS if self.lattice.weight_count else _FIELDS[:3]
 
-    def _fields(self) -> dict[str, Any]:
+    def _fields(self) -> dict[str, mi.Float]:
         return {name: getattr(self, name) for name in self.field_names}
 
     def _in_world(self, surface: SurfaceMesh) -> SurfaceMesh:
@@ -265,7 +267,7 @@ class GShell(mi.Mesh):
             **self._mesh_attributes(vertices),
         )
 
-    def _mesh_attributes(self, vertices: "_Padding") -> dict[str, Any]:
+    def _mesh_attributes(self, vertices: _Padding) -> dict[str, mi.Float]:
         return {
             name: dr.ravel(vertices.apply(self.surface.interpolate(field, channels)))
             for name, (field, channels) in self._attributes.items()
@@ -286,7 +288,7 @@ class _Padding:
         step = max(1 << max(count - 1, 0).bit_length() - 3, 16) if count > 4 else 16
         self.size = max(-(-count // step) * step, step)
 
-    def apply(self, values: Any, fill_with_zero: bool = False) -> Any:
+    def apply(self, values: ArrayT, fill_with_zero: bool = False) -> ArrayT:
         if self.count == 0:
             return dr.zeros(type(values), self.size)
         index = dr.arange(mi.UInt32, self.size)
@@ -295,7 +297,7 @@ class _Padding:
         return dr.select(exists, padded, 0) if fill_with_zero else padded
 
 
-def _initial_fields(filename: str, grid: str, resolution: int | None, to_world: Any,
+def _initial_fields(filename: str, grid: str, resolution: int | None, to_world: mi.ScalarTransform4f,
                     band: bool) -> LatticeFields:
     lattice = make_lattice(grid, 64 if resolution is None else resolution)
     if lattice.resolution > _LARGE and not band:

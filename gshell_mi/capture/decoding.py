@@ -133,7 +133,7 @@ class ColorDecoding:
     color_space: str = "sRGB"
     transfer: str | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         colour = colour_science()
         _known(self.color_space, colour.RGB_COLOURSPACES, "--color-space", "colour space")
         if self.transfer not in (None, "linear"):

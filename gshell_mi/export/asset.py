@@ -46,7 +46,7 @@ class AssetConfig:
     """No triangle of remeshed.ply is worse than this: 4 sqrt(3) area / sum of squared edge lengths, which is
     1 if equilateral."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.texture_size < 16:
             raise UserError(f"--texture-size must be at least 16 pixels, not {self.texture_size}.")
         if self.face_count < 0:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -111,7 +110,7 @@ class LatticeFields:
         return LatticeFields(**{name: field.numpy() for name, field in fields.items()}, grid=self.grid,
                              blocks=blocks.blocks.numpy(), block_resolution=new.resolution)
 
-    def _resampler(self, lattice: Lattice) -> Callable[[Any], dict[str, Any]]:
+    def _resampler(self, lattice: Lattice) -> Callable[[mi.Point3f], dict[str, mi.Float]]:
         """From vertices of another lattice to its fields there, such that the surface stays in place."""
         import drjit as dr
         import mitsuba as mi

@@ -302,7 +302,7 @@ class BlockLattice:
 class _Table:
     """From coordinates to the rank of what is stored there; a dense array, but of rows or blocks only."""
 
-    def __init__(self, keys: UInt32, sizes: tuple, count: int):
+    def __init__(self, keys: UInt32, sizes: tuple[UInt32, UInt32, UInt32], count: int):
         self._uint_t = type(keys)
         self._sizes = sizes
         self._rank = dr.full(self._uint_t, MISSING, count)

@@ -90,7 +90,7 @@ class Lattice:
 
     resolution: int
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not 1 <= self.resolution <= 800:
             raise UserError(
                 f"lattice resolution must be between 1 and 800 cells per side, not {self.resolution}"

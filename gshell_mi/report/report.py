@@ -43,7 +43,7 @@ class ReportConfig:
     views: int = 8
     """Views that are shown, spread evenly over the training views."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.views < 1:
             raise UserError(f"--views must be at least 1, not {self.views}.")
 
