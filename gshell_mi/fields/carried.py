@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import drjit as dr
-import mitsuba as mi
 
 from ..arrays import Bool, Float, UInt32
 from ..lattice import MISSING, BlockLattice
 from ..lattice.sign_words import is_set
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 
 class Carried:

@@ -6,12 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .. import memory
 from ..errors import UserError
 from ..lattice import BlockLattice, Lattice, block_count, lattice_of, make_lattice
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 #: Steps that find the point an offset has brought somewhere; the error halves with each, or better.
 _FIXED_POINT_STEPS = 4
