@@ -1,6 +1,7 @@
 # make fit    set everything up and reconstruct SCENE (default scenes/tshirt.xml) into OUT
 # make test   set everything up, check the style and run the tests
 # make scenes rebuild the scenes from code
+# make docs   build the documentation into build/site
 # make fuzz   try damaged inputs of every kind, for ten minutes
 
 SHELL := /bin/bash
@@ -17,20 +18,24 @@ PY := $(VENV)/bin/python
 export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help fit test scenes fuzz clean
+.PHONY: help fit test scenes docs fuzz clean
 
 help:
-	@sed -n 's/^# //p' Makefile | head -4
+	@sed -n 's/^# //p' Makefile | head -5
 
 fit: $(VENV)/.llvm
 	@$(PY) -m gshell_mi.fit $(SCENE) -o $(OUT) --overwrite $(ARGS)
 
 test: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) -m ruff check --quiet .
+	@$(PY) -m basedpyright --pythonpath $(PY)
 	@$(PY) -m pytest $(ARGS)
 
 scenes: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) pipelines/make_scenes.py $(ARGS)
+
+docs: $(VENV)/.docs
+	@$(PY) -m mkdocs build --quiet --strict $(ARGS)
 
 fuzz: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) pipelines/fuzz.py $(ARGS)
@@ -47,6 +52,11 @@ $(VENV)/.package: $(PY) pyproject.toml
 $(VENV)/.test: $(VENV)/.package
 	@echo "Installing the tests' tools into $(VENV) ..."
 	@$(PY) -m pip install --quiet --editable '.[test]'
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.package
+	@echo "Installing the documentation's tools into $(VENV) ..."
+	@$(PY) -m pip install --quiet --editable '.[docs]'
 	@touch $@
 
 # Dr.Jit's wheels leave two libraries to the system: libatomic, and LLVM, which they load when first used.

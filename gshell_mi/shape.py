@@ -32,37 +32,35 @@ _LARGE = 200
 class GShell(mi.Mesh):
     """G-Shell (``gshell``): the surface ``{sdf = 0, msdf >= 0}`` of fields on a lattice.
 
-    ======================  =================================================================
-    ``resolution``          integer: cells per side of the lattice (default: that of the file, or 64)
-    ``grid``                string: ``tet`` (default), ``cube``, ``flexicubes`` or ``bcc``, see ``lattice``
-    ``to_world``            transform: maps the lattice's cube [-1, 1]^3 to the world
-    ``filename``            string: initial fields: an .npz with ``sdf`` and, if wanted, ``msdf`` and
-                            ``deform``, or a mesh file in world space (default: a sphere of radius 0.5
-                            in lattice units)
-    ``band``                boolean: keep the fields in blocks around the surface only, so that memory
-                            grows with the square of the resolution (default: false)
-    ``face_normals``        boolean: shade with face normals (default: false, smooth normals)
-    (nested)                bsdf: the material
-    ======================  =================================================================
+    Plugin parameters:
+
+    * ``resolution`` (int): cells per side of the lattice (default: that of the file, or 64).
+    * ``grid`` (string, default ``tet``): ``tet``, ``cube``, ``flexicubes`` or ``bcc``, see ``lattice``.
+    * ``to_world`` (transform): maps the lattice's cube [-1, 1]^3 to the world.
+    * ``filename`` (string): initial fields: an .npz with ``sdf`` and, if wanted, ``msdf`` and ``deform``, or
+      a mesh file in world space (default: a sphere of radius 0.5 in lattice units).
+    * ``band`` (bool, default false): keep the fields in blocks around the surface only, so that memory grows
+      with the square of the resolution.
+    * ``face_normals`` (bool, default false): shade with face normals instead of smooth ones.
+    * a nested ``bsdf``: the material.
 
     ``mi.traverse`` shows, beside the parameters of a mesh:
 
-    ======================  =================================================================
-    ``sdf``, ``msdf``       one value per lattice vertex, in lattice units; with ``band`` per stored
-                            vertex of ``lattice``, a ``BlockLattice``, and so the others
-    ``deform``              three values per lattice vertex; 1 is the greatest offset that rules out
-                            self-intersection, beyond it they are clipped
-    ``weights``             with ``flexicubes`` only: 21 values per cube, 0 is neutral, see ``extract``
-    ``lattice_<name>``      the lattice field of the mesh attribute ``<name>``, after
-                            ``attach_attribute``
-    ======================  =================================================================
+    * ``sdf``, ``msdf``: one value per lattice vertex, in lattice units; with ``band`` per stored vertex of
+      ``lattice``, a ``BlockLattice``, and so the others.
+    * ``deform``: three values per lattice vertex; 1 is the greatest offset that rules out self-intersection,
+      beyond it they are clipped.
+    * ``weights``: with ``flexicubes`` only: 21 values per cube, 0 is neutral, see ``extract``.
+    * ``lattice_<name>``: the lattice field of the mesh attribute ``<name>``, after ``attach_attribute``.
 
     When any of them changes, ``params.update()`` extracts the mesh anew; derivatives of its vertices,
     normals and attributes lead back to the fields. Vertex and face buffers are padded to sizes from a
     geometric ladder, as the kernels of a renderer contain buffer sizes: trailing faces are ``(0, 0, 0)``
     and trailing vertices copies of the first. ``surface`` is the mesh without padding.
 
-    XML: ``<shape type="gshell" id="subject"><integer name="resolution" value="64"/></shape>``
+    ```xml
+    <shape type="gshell" id="subject"> <integer name="resolution" value="64"/> </shape>
+    ```
 
     >>> import mitsuba as mi
     >>> scene = mi.load_dict({"type": "scene", "subject": {"type": "gshell", "resolution": 16}})

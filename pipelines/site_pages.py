@@ -1,0 +1,97 @@
+"""The pages of the documentation that are not files in ``docs``: a hook of MkDocs, used by ``make docs``.
+
+README.md, CONTRIBUTING.md and CHANGELOG.md become pages, and every public module of the library is described
+on one made from its docstrings.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[1]
+
+#: Pages of the repository's own files.
+OWN_FILES = {"index.md": "README.md", "contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
+
+#: Pages of the library: title, what is said first, and the modules and packages that each describes.
+LIBRARY = {
+    "lattice": ("Lattices", "Where the fields live.", ["lattice", "arrays", "bricks"]),
+    "fields": ("Fields", "Signed distances on a lattice, and how they begin.",
+               ["fields", "parametrisation", "activations"]),
+    "extraction": ("Extraction", "From fields to meshes, with derivatives.", ["extraction"]),
+    "mesh": ("Meshes", "From meshes back to fields; what meshes are like.",
+             ["conversion", "mesh_files", "topology", "triangles", "visibility", "diagnostics"]),
+    "shape": ("The shape plugin", "`gshell` for Mitsuba.", ["shape", "plugins", "compat"]),
+    "integrators": ("Integrators", "`gshell_path` and `gshell_mask` for Mitsuba.", ["integrators"]),
+    "capture": ("Capture", "From photographs to fit scenes.", ["capture"]),
+    "scene": ("Fit scenes", "What a fit starts from, and files that anybody may have written.",
+              ["scene", "targets", "views", "scene_files", "scene_inputs", "images", "float_images",
+               "environment_maps", "json_files"]),
+    "fit": ("Fit", "From scenes to surfaces, materials and light.", ["fit"]),
+    "losses": ("Losses, material, light", "What a fit minimises, and what it changes beside the surface.",
+               ["losses", "means", "material", "light", "texture", "color_detail", "schedules", "outliers",
+                "tempered_adam"]),
+    "evaluation": ("Evaluation", "How good a result is.", ["evaluation", "compare"]),
+    "export": ("Export", "What a fit leaves behind, and what can be made of it.",
+               ["export", "turntable", "report", "viewer"]),
+    "commands": ("Commands and machine", "What the commands share, and what the machine can do.",
+                 ["command_line", "streams", "interrupt", "errors", "files", "own_folder", "memory", "timing",
+                  "wording", "doctor"]),
+}
+
+#: Packages of which only the modules right inside are described: what lies deeper may change.
+_SHALLOW = {"fit"}
+
+
+def public_modules(folder: Path = ROOT / "gshell_mi") -> list[str]:
+    """Dotted names, without ``gshell_mi``, of the modules and packages that are described."""
+    found = []
+    for path in sorted(folder.rglob("*.py")):
+        parts = path.relative_to(folder).with_suffix("").parts
+        parts = parts[:-1] if parts[-1] == "__init__" else parts
+        hidden = not parts or any(part.startswith("_") for part in parts)
+        if not hidden and (parts[0] not in _SHALLOW or path.parent == folder / parts[0]):
+            found.append(".".join(parts))
+    return found
+
+
+def modules_of(page: str) -> list[str]:
+    """The modules that a page of the library describes: of each package first itself, then its modules."""
+    modules = public_modules()
+    return [module for room in LIBRARY[page][2]
+            for module in modules if module == room or module.startswith(f"{room}.")]
+
+
+def library_page(page: str) -> str:
+    """The Markdown of a page of the library."""
+    title, first, _ = LIBRARY[page]
+    blocks = [f"# {title}", first, *(f"::: gshell_mi.{module}" for module in modules_of(page))]
+    return "\n\n".join(blocks) + "\n"
+
+
+def own_page(name: str) -> str:
+    """The Markdown of a file of the repository, with its links as they are from within ``docs``."""
+    text = (ROOT / OWN_FILES[name]).read_text()
+    for page, source in OWN_FILES.items():
+        text = text.replace(f"]({source}", f"]({page}")
+    return re.sub(r"\]\(docs/", "](", text)
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Puts the pages of the library into the navigation."""
+    section = next(entry["Library"] for entry in config.nav or [] if "Library" in entry)
+    section.extend({title: f"api/{page}.md"} for page, (title, _, _) in LIBRARY.items())
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Adds the pages."""
+    for name in OWN_FILES:
+        files.append(File.generated(config, name, content=own_page(name)))
+    for page in LIBRARY:
+        files.append(File.generated(config, f"api/{page}.md", content=library_page(page)))
+    return files
