@@ -1,5 +1,5 @@
 # make fit    set everything up and reconstruct SCENE (default scenes/tshirt.xml) into OUT
-# make test   set everything up, check the style and run the tests
+# make test   set everything up, check the style and the types, and run the tests
 # make scenes rebuild the scenes from code
 # make docs   build the documentation into build/site
 # make fuzz   try damaged inputs of every kind, for ten minutes
@@ -17,6 +17,7 @@ PY := $(VENV)/bin/python
 # BLAS threads and Dr.Jit's thread pool fight for the same cores.
 export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export NO_MKDOCS_2_WARNING := 1
 
 .PHONY: help fit test scenes docs fuzz clean
 
