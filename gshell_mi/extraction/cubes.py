@@ -74,7 +74,7 @@ class CubeExtraction(MarchingExtraction[_Polygons]):
         exists = edge != 0
         corners = self.edge_vertex(record, dr.gather(self.uint_t, base, polygon), edge, exists)
         corners = dr.select(exists, corners, 0)
-        size = dr.popcnt(_Polygons(key, None, corners).mask(exists))
+        size = dr.popcnt(_Polygons(key, key, corners).mask(exists))
         dr.eval(corners, size)
         return _Polygons(key, size, corners)
 

@@ -71,11 +71,11 @@ def extract(
                 f"weights belong to the grid 'flexicubes', not to '{lattice.grid}'; leave them out"
             )
         sizes["weights"], fields["weights"] = lattice.weight_count, weights
-    fields = {name: _flat(name, field, sizes[name]) for name, field in fields.items() if field is not None}
-    _check_finite(fields)
-    algorithm = _ALGORITHMS[lattice.grid](lattice, type(fields["sdf"]))
-    arguments = (fields.get(name) for name in ("sdf", "msdf", "deform"))
-    return algorithm.run(*arguments, template, fields.get("weights"))
+    checked = {name: _flat(name, field, sizes[name]) for name, field in fields.items() if field is not None}
+    _check_finite(checked)
+    algorithm = _ALGORITHMS[lattice.grid](lattice, type(checked["sdf"]))
+    return algorithm.run(checked["sdf"], checked.get("msdf"), checked.get("deform"), template,
+                         checked.get("weights"))
 
 
 def _flat(name: str, field: Field, count: int) -> Field:

@@ -72,7 +72,7 @@ class FlexiCubesExtraction(GridExtraction):
         if kept_count == 0 and not with_template:
             return self.empty_mesh(False)
         faces, diagonal = self.quads(cells.inside, a, polygons, weights, deform)
-        if kept_count in (0, points.count):
+        if msdf is None or kept_count in (0, points.count):
             uncut = self.mesh((points,), faces, msdf, deform, kept_count)
             mesh = uncut if kept_count else self.empty_mesh(False)
             return replace(mesh, template=uncut) if with_template else mesh
@@ -175,7 +175,7 @@ class FlexiCubesExtraction(GridExtraction):
         side = self.stride - 1
         return x + (y + z * side) * side
 
-    def weight(self, weights: Float | None, index: UInt32) -> Float:
+    def weight(self, weights: Float, index: UInt32) -> Float:
         return positive_weight(gather(self.float_t, weights, index))
 
     # Quads --------------------------------------------------------------------------------------------

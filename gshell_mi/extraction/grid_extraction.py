@@ -95,8 +95,9 @@ class GridExtraction(ABC):
 
     def active_cells(self, s: Float) -> ActiveCells:
         """The cells with crossed edges and few others."""
-        blocks = isinstance(self.lattice, BlockLattice)
-        cell, inside = self.lattice.active_cells(s) if blocks else active_cells(s, self.lattice)
+        lattice = self.lattice
+        blocks = isinstance(lattice, BlockLattice)
+        cell, inside = lattice.active_cells(s) if blocks else active_cells(s, lattice)
         # Operands of size 0 do not go together with others of size 1.
         return self.classify(inside, cell) if dr.width(cell) else ActiveCells(inside, cell, cell, cell, cell)
 
@@ -242,7 +243,7 @@ class MarchingExtraction(GridExtraction, Generic[PolygonsT]):
             kept_count = dr.width(kept)
         if kept_count == 0 and not with_template:
             return self.empty_mesh(False)
-        if kept_count in (0, count):
+        if msdf is None or kept_count in (0, count):
             points = self.edge_points(sdf, a, b)
             uncut = self.mesh((points,), self.triangulate(polygons), msdf, deform, kept_count)
             mesh = uncut if kept_count else self.empty_mesh(False)

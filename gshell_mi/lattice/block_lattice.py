@@ -94,11 +94,11 @@ class BlockLattice:
         self._lacking = dr.select(here, uint_t(0), 1)
         self._lacking |= dr.select(before, uint_t(0), 2) | dr.select(after, uint_t(0), 4)
         dr.eval(self._lacking)
-        sdf = dr.detach(sdf(self))
-        self.beyond: UInt32 = pack_signs(sdf) & self.edge
+        values = dr.detach(sdf(self))
+        self.beyond: UInt32 = pack_signs(values) & self.edge
         """Per row, bit i: it is the inside that lies beyond the edge vertex i."""
         dr.eval(self.beyond)
-        cells, _ = self.active_cells(sdf)
+        cells, _ = self.active_cells(values)
         if dr.width(cells) and dr.any(is_set(self.edge, cells))[0]:
             raise UserError("the surface of sdf runs out of the blocks; BlockLattice.around finds those that "
                             "it needs")
@@ -117,12 +117,13 @@ class BlockLattice:
             raise UserError(f"the grid '{lattice.grid}' cannot be stored in blocks; choose another or leave "
                             f"out the band")
         if not callable(sdf):
-            sdf = dr.detach(sdf.array if dr.is_tensor_v(sdf) else sdf)
-            if dr.width(sdf) != lattice.vertex_count:
-                raise UserError(f"sdf has {dr.width(sdf)} values, but the lattice needs "
+            field = dr.detach(sdf.array if dr.is_tensor_v(sdf) else sdf)
+            if dr.width(field) != lattice.vertex_count:
+                raise UserError(f"sdf has {dr.width(field)} values, but the lattice needs "
                                 f"{lattice.vertex_count}")
-            cells, _ = active_cells(sdf, lattice)
-            return cls(lattice, _blocks_near(lattice, cells), lambda blocks: blocks.take(sdf))
+            cells, _ = active_cells(field, lattice)
+            return cls(lattice, _blocks_near(lattice, cells), lambda blocks: blocks.take(field))
+        assert float_t is not None, "a function needs a type of numbers to compute with"
         uint_t = dr.uint32_array_t(float_t)
         inside = dr.empty(uint_t, -(-lattice.vertex_count // 32))
         last = dr.opaque(uint_t, lattice.vertex_count - 1)
@@ -335,7 +336,8 @@ class _Table:
 
 
 def _block_counts(lattice: Lattice) -> tuple[int, int, int]:
-    return tuple(-(-lattice.stride // side) for side in BLOCK)
+    nx, ny, nz = (-(-lattice.stride // side) for side in BLOCK)
+    return nx, ny, nz
 
 
 def block_count(lattice: Lattice) -> int:
