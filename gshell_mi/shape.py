@@ -184,10 +184,10 @@ class GShell(mi.Mesh):
         Returns:
             What brings an optimiser's state to the new blocks; None if the blocks stay.
         """
-        before = self.lattice
-        if not isinstance(before, BlockLattice) or (not rescan and before.covers(self.surface.cells)):
+        before, cells = self.lattice, self.surface.cells
+        if not isinstance(before, BlockLattice) or cells is None or (not rescan and before.covers(cells)):
             return None
-        carried = Carried.following(before, self.surface.cells, self.sdf, keep=not rescan)
+        carried = Carried.following(before, cells, self.sdf, keep=not rescan)
         if carried.is_identity:
             return None
         params = mi.traverse(self)

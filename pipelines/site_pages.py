@@ -6,6 +6,8 @@ on one made from its docstrings.
 
 from __future__ import annotations
 
+import ast
+import json
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,7 +30,8 @@ LIBRARY = {
     "mesh": ("Meshes", "From meshes back to fields; what meshes are like.",
              ["conversion", "mesh_files", "topology", "triangles", "visibility", "diagnostics"]),
     "shape": ("The shape plugin", "`gshell` for Mitsuba.", ["shape", "plugins", "compat"]),
-    "integrators": ("Integrators", "`gshell_path` and `gshell_mask` for Mitsuba.", ["integrators"]),
+    "integrators": ("Integrators", "`gshell_path` and `gshell_mask` for Mitsuba.",
+                    ["integrators.gshell_path", "integrators.gshell_mask", "integrators"]),
     "capture": ("Capture", "From photographs to fit scenes.", ["capture"]),
     "scene": ("Fit scenes", "What a fit starts from, and files that anybody may have written.",
               ["scene", "targets", "views", "scene_files", "scene_inputs", "images", "float_images",
@@ -64,14 +67,29 @@ def public_modules(folder: Path = ROOT / "gshell_mi") -> list[str]:
 def modules_of(page: str) -> list[str]:
     """The modules that a page of the library describes: of each package first itself, then its modules."""
     modules = public_modules()
-    return [module for room in LIBRARY[page][2]
-            for module in modules if module == room or module.startswith(f"{room}.")]
+    found = [module for room in LIBRARY[page][2]
+             for module in modules if module == room or module.startswith(f"{room}.")]
+    return list(dict.fromkeys(found))
+
+
+def exports(package: Path) -> list[str]:
+    """The names in the ``__all__`` of a package."""
+    for statement in ast.parse((package / "__init__.py").read_text()).body:
+        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "__all__":
+            return ast.literal_eval(statement.value)
+    return []
 
 
 def library_page(page: str) -> str:
-    """The Markdown of a page of the library."""
+    """The Markdown of a page of the library: what a package exports stands there, and not at its modules."""
     title, first, _ = LIBRARY[page]
-    blocks = [f"# {title}", first, *(f"::: gshell_mi.{module}" for module in modules_of(page))]
+    blocks = [f"# {title}", first]
+    for module in modules_of(page):
+        blocks.append(f"::: gshell_mi.{module}")
+        package = ROOT / "gshell_mi" / module.split(".")[0]
+        if "." in module and (exported := exports(package)):
+            filters = ["!^_", *(f"!^{name}$" for name in exported)]
+            blocks[-1] += f"\n    options:\n      filters: {json.dumps(filters)}"
     return "\n\n".join(blocks) + "\n"
 
 

@@ -261,7 +261,7 @@ class GShellPathIntegrator(ADIntegrator):
                 beta, active = self.roulette(beta * weight, eta, depth, sampler, active)
                 pi = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active)
             depth = depth + 1
-            to_point = None
+            to_point = mi.Spectrum(0)   # replaced wherever it counts
             if surface_emitters or vertex == 1:
                 p_next, area_next = material_point(pi, ray_next, active)
                 d, solid_angle = segment(si.p, p_next, area_next, active & pi.is_valid(), ray_next.d)
@@ -295,6 +295,7 @@ class GShellPathIntegrator(ADIntegrator):
 
         if not deeper:
             return radiance, alpha, mi.Point3f(0), None
+        assert state is not None, "replays(scene) has asked for it"
         rest = state.value - dr.detach(radiance)
         radiance += dr.select(active, to_point * rest, 0)
         return radiance, alpha, si.p, (scene, sampler, ray_next, pi, si_now, rest, beta, eta, sample.pdf,

@@ -10,6 +10,8 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
+from .supported_scenes import sensor_of
+
 #: Sizes of packets.
 _PACKETS = (1, 2, 4, 8)
 
@@ -17,8 +19,7 @@ _PACKETS = (1, 2, 4, 8)
 def render(integrator: ADIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, seed: int,
            spp: int) -> mi.TensorXf:
     """The image that ``ADIntegrator.render`` gives."""
-    if isinstance(sensor, int):
-        sensor = scene.sensors()[sensor]
+    sensor = sensor_of(scene, sensor)
     film, names = sensor.film(), integrator.aov_names()
     with dr.suspend_grad():
         sampler, spp = integrator.prepare(sensor, seed, spp, names)

@@ -18,7 +18,7 @@ from .film_splat import FilmSplat
 from .path_sample import PathSample
 from .pixel_borders import PixelBorders
 from .silhouette_edges import screen_edges
-from .supported_scenes import check_meshes, check_sensor, warn_once
+from .supported_scenes import check_meshes, check_sensor, sensor_of, warn_once
 from .warp import EdgeGrid, FilmWarp, fixed_line_weight
 
 
@@ -78,16 +78,18 @@ class Warp:
         margin = self.radius + 2 - samples.origin[0]
         self.edges = screen_edges(scene, tables, sensor, margin, cull=integrator.cull_hidden,
                                   crease_angle=integrator.crease_angle)
-        self.grid = None
+        self.grid: EdgeGrid | None = None
+        if self.edges is None:
+            return
         with dr.resume_grad():
-            moving = self.edges is not None and dr.grad_enabled((self.edges.a, self.edges.b))
+            moving = dr.grad_enabled((self.edges.a, self.edges.b))
         if moving:
             self.grid = EdgeGrid(self.edges.a, self.edges.b, self.radius, samples.origin, samples.size)
 
     def __call__(self, u: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
         """T(u) and det T(u), attached, for positions in pixels relative to the crop window."""
         u = mi.Point2f(dr.detach(u))
-        if self.grid is None:
+        if self.grid is None or self.edges is None:
             return u, mi.Float(1)
         fixed, grad_fixed = self._fixed_lines(u)
         dr.eval(u, fixed, grad_fixed)
@@ -135,8 +137,7 @@ def _borders(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, war
 
 def _prepare(integrator: FilmIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, seed: int,
              spp: int) -> tuple[mi.Sensor, mi.Sampler, int, CameraSamples]:
-    if isinstance(sensor, int):
-        sensor = scene.sensors()[sensor]
+    sensor = sensor_of(scene, sensor)
     check_sensor(sensor)
     check_meshes(scene)
     warn_once(scene, integrator.said)

@@ -20,6 +20,11 @@ def has_bsdf_flag(scene: mi.Scene, flag: mi.BSDFFlags) -> bool:
                for shape in scene.shapes())
 
 
+def sensor_of(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
+    """A sensor, which may be given by its number in the scene."""
+    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+
+
 def check_sensor(sensor: mi.Sensor) -> None:
     """Raises for sensors whose silhouettes are not those of one viewpoint, and for special films."""
     if sensor.class_name() != "PerspectiveCamera":
