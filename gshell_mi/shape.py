@@ -201,7 +201,9 @@ class GShell(mi.Mesh):
 
     def template(self) -> SurfaceMesh:
         """The watertight template of the present fields, in world space."""
-        return self._in_world(extract(self.lattice, **self._fields(), template=True).template)
+        template = extract(self.lattice, **self._fields(), template=True).template
+        assert template is not None, "it was asked for"
+        return self._in_world(template)
 
     def surface_of(self, fields: LatticeFields, *, template: bool = False) -> SurfaceMesh:
         """The surface of other fields in this shape's place, in world space; the shape stays as it is.

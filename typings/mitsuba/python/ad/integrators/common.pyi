@@ -1,4 +1,6 @@
 
+from typing import Any
+
 from mitsuba import Integrator
 
 class ADIntegrator(Integrator):
