@@ -73,10 +73,11 @@ def modules_of(page: str) -> list[str]:
 
 
 def exports(package: Path) -> list[str]:
-    """The names in the ``__all__`` of a package."""
+    """The names in the ``__all__`` of a package, but those that a module of it has, too."""
     for statement in ast.parse((package / "__init__.py").read_text()).body:
         if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "__all__":
-            return ast.literal_eval(statement.value)
+            names = ast.literal_eval(statement.value)
+            return [name for name in names if not (package / f"{name}.py").exists()]
     return []
 
 
