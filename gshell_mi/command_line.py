@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import tyro
@@ -37,9 +38,9 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
     """
     def run() -> int:
         check(sys.argv[1:] if given is None else given)
-        parsed = tyro.cli(arguments, args=given, prog=f"python -m gshell_mi.{name}", description=description,
-                          config=(tyro.conf.FlagCreatePairsOff,),
-                          **({} if default is None else {"default": default}))
+        parse = partial(tyro.cli, arguments, args=given, prog=f"python -m gshell_mi.{name}",
+                        description=description, config=(tyro.conf.FlagCreatePairsOff,))
+        parsed = parse() if default is None else parse(default=default)
         with Interrupt() as interrupt:
             try:
                 ensure_variant(parsed.variant)

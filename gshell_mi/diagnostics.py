@@ -62,7 +62,7 @@ class Diagnostics:
         if self.self_contact > CONTACT_LIMIT:
             found.append(f"{100 * self.self_contact:.0f} % of the surface is within a cell of another sheet "
                          f"of its template, where details merge: raise --resolution.")
-        if self.unobserved > UNOBSERVED_LIMIT:
+        if self.unobserved > UNOBSERVED_LIMIT and self.unobserved_center:
             x, y, z = self.unobserved_center
             found.append(f"{100 * self.unobserved:.0f} % of the surface is seen by no view and is a guess: "
                          f"add views of the parts around ({x:.2f}, {y:.2f}, {z:.2f}).")
@@ -102,7 +102,8 @@ def diagnose(surface: tuple[np.ndarray, np.ndarray], template: tuple[np.ndarray,
     touching = _touching(centers, normals, template, cell)
     unseen = area * (best_view(centers, normals, surface, views) == 0)
     total = max(area.sum(), 1e-30)
-    center = tuple(float(x) for x in unseen @ centers / unseen.sum()) if unseen.any() else None
+    x, y, z = unseen @ centers / max(unseen.sum(), 1e-30)
+    center = (float(x), float(y), float(z)) if unseen.any() else None
     return Diagnostics(counts.components - floaters, floaters, counts.boundary_loops, counts.pinholes,
                        float(area[touching].sum() / total), float(unseen.sum() / total), center)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -114,7 +116,7 @@ def principled(base_color: mi.Texture | None = None) -> dict:
     Args:
         base_color: another texture for the base colour.
     """
-    textures = {parameter: {"type": "mesh_attribute", "name": attribute}
+    textures: dict[str, Any] = {parameter: {"type": "mesh_attribute", "name": attribute}
                 for attribute, parameter in ATTRIBUTES.items()}
     if base_color is not None:
         textures["base_color"] = base_color

@@ -142,7 +142,7 @@ def _resolving_beside(path: Path) -> Iterator[None]:
 
 def _check_plugin(name: str) -> None:
     # Names that are registered in Python for this variant are found without a search for a file.
-    registered = () if mi.variant().startswith("scalar") else (*OWN_PLUGINS, *MITSUBA_INTEGRATORS)
+    registered = () if (mi.variant() or "").startswith("scalar") else (*OWN_PLUGINS, *MITSUBA_INTEGRATORS)
     native = re.fullmatch(r"\w+", name) and any((mitsuba_folder() / "plugins").glob(f"{name}.*"))
     if name not in ("scene", *registered) and not native:
         raise ValueError(f"it names a plugin '{name}', which neither Mitsuba nor gshell_mi has; scenes may "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -167,7 +168,7 @@ class GShell(mi.Mesh):
 
     def fields(self) -> LatticeFields:
         """A copy of the present fields on the host."""
-        arrays = {name: np.array(dr.detach(getattr(self, name))) for name in self.field_names}
+        arrays: dict[str, Any] = {name: np.array(dr.detach(getattr(self, name))) for name in self.field_names}
         if isinstance(self.lattice, BlockLattice):
             arrays |= {"blocks": self.lattice.blocks.numpy(), "block_resolution": self.lattice.resolution}
         return LatticeFields(grid=self.lattice.grid, **arrays)

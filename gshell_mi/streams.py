@@ -63,7 +63,7 @@ class Forgiving:
         self._stream, self.error = stream, None
 
     def write(self, text: str) -> int:
-        self._try(lambda: self._stream.write(text))
+        self._try(lambda stream: stream.write(text))
         return len(text)
 
     def writelines(self, lines: Iterable[str]) -> None:
@@ -71,16 +71,16 @@ class Forgiving:
             self.write(line)
 
     def flush(self) -> None:
-        self._try(lambda: self._stream.flush())
+        self._try(lambda stream: stream.flush())
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
-    def _try(self, action: Callable[[], object]) -> None:
+    def _try(self, action: Callable[[TextIO], object]) -> None:
         if self._stream is None or self.error is not None:
             return
         try:
-            action()
+            action(self._stream)
         except (OSError, ValueError) as error:  # ValueError: it was closed
             self.error = error
             # What is left in its buffer, and what compiled code prints, has to go somewhere.

@@ -41,6 +41,7 @@ def rim_cut(
     """
     lattice = fields.lattice
     template = extract(lattice, mi.Float(fields.sdf))
+    assert isinstance(lattice, Lattice) and template.stencil is not None
     vertices, faces, _ = template.to_numpy()
     edges, _ = mesh_edges(faces)
     rims = cKDTree(rim)

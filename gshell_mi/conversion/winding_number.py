@@ -15,7 +15,7 @@ def winding_number(grid: CubicGrid, mesh: trimesh.Trimesh) -> np.ndarray:
     """
     n, h = grid.stride, grid.spacing
     count = int(np.clip(6 * mesh.area / h**2, 20_000, 1_000_000))
-    samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+    samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
     area_normals = mesh.face_normals[faces] * mesh.area / count
     cell = (samples - grid.origin) / h
     low = np.clip(np.floor(cell).astype(int), 0, n - 2)

@@ -140,6 +140,7 @@ def _simplified(fine: FittedMesh, face_count: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _write_remeshed(folder: Path, fine: FittedMesh, config: AssetConfig) -> dict:
+    assert config.remesh is not None
     vertices, faces = remesh(fine.vertices, fine.faces, config.remesh, resample_boundary=True,
                              min_quality=config.min_quality)
     normals = vertex_normals(vertices, faces)

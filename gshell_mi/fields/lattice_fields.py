@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -105,7 +105,7 @@ class LatticeFields:
         old, new = self.lattice, make_lattice(self.grid, resolution or self.lattice.resolution)
         if new == old:
             given = {name: mi.Float(getattr(self, name)) for name in ("sdf", "msdf", "deform")}
-            blocks = BlockLattice.around(old, given["sdf"])
+            blocks = BlockLattice.around(new, given["sdf"])
             fields = {name: blocks.take(field) for name, field in given.items()}
         else:
             resampled = self._resampler(new)
@@ -121,7 +121,9 @@ class LatticeFields:
 
         from .interpolation import Interpolation
 
-        at = {name: Interpolation(mi.Float(getattr(self, name)), self.lattice)
+        own = self.lattice
+        assert isinstance(own, Lattice), "what is stored in blocks is not resampled"
+        at = {name: Interpolation(mi.Float(getattr(self, name)), own)
               for name in ("sdf", "msdf", "deform")}
 
         def offset(vertices: mi.Point3f) -> mi.Vector3f:
@@ -140,11 +142,11 @@ class LatticeFields:
 
     def save(self, path: str | Path) -> None:
         """Writes a compressed .npz with the arrays ``sdf``, ``msdf``, ``deform`` and, if any, the others."""
-        weights = {} if self.weights is None else {"weights": self.weights}
+        others: dict[str, Any] = {} if self.weights is None else {"weights": self.weights}
         if self.blocks is not None:
-            weights |= {"blocks": self.blocks, "block_resolution": np.array(self.block_resolution)}
+            others |= {"blocks": self.blocks, "block_resolution": np.array(self.block_resolution)}
         with open(path, "wb") as file:  # a file object, as NumPy would append .npz to other names
-            np.savez_compressed(file, sdf=self.sdf, msdf=self.msdf, deform=self.deform, **weights)
+            np.savez_compressed(file, sdf=self.sdf, msdf=self.msdf, deform=self.deform, **others)
 
     @classmethod
     def load(cls, path: str | Path, grid: str = "tet") -> LatticeFields:

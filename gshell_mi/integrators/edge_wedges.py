@@ -78,7 +78,7 @@ def build_edge_wedges(tables: list[tuple[mi.Mesh, EdgeTable]],
     with dr.resume_grad():
         positions = join(buffers)
     columns = [join([part[k] for part in parts]) for k in range(len(parts[0]))]
-    return EdgeWedges(positions, *columns[:-1], len(parts), columns[-1])
+    return EdgeWedges(positions, *columns[:-1], meshes=len(parts), mesh_mass=columns[-1])
 
 
 def _mesh_wedges(mesh: mi.Mesh, table: EdgeTable, crease_angle: float,

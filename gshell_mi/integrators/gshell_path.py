@@ -64,7 +64,7 @@ class GShellPathIntegrator(ADIntegrator):
         gradient_depth = props.get("gradient_depth", max(self.max_depth, 1))
         if gradient_depth < 1:
             raise UserError(f"gshell_path: gradient_depth is {gradient_depth}, but has to be at least 1.")
-        self.gradient_depth = min(gradient_depth, self.max_depth)
+        self.gradient_depth: int = min(gradient_depth, self.max_depth)
         self.reparam_depth = props.get("reparam_depth", 1)
         if self.reparam_depth not in (1, 2, 3):
             raise UserError(f"gshell_path: reparam_depth is {self.reparam_depth}, but has to be 1, 2 or 3.")
@@ -204,7 +204,8 @@ class GShellPathIntegrator(ADIntegrator):
             total = on_sample(radiance, alpha, state.aovs)
             if tail is not None:
                 with dr.suspend_grad():
-                    on_last = replay(self, mode, *tail, _adjoint_of_value(on_sample, state), mi.Vector3f(0))
+                    on_last = replay(self, mode, *tail, adjoint=_adjoint_of_value(on_sample, state),
+                                     p_tangent=mi.Vector3f(0))
                 total += dr.dot(last, on_last)
             return total, state
         # Interior gradients are results too, and the replay needs those of the inputs again.
@@ -213,7 +214,8 @@ class GShellPathIntegrator(ADIntegrator):
         film_tangents = [dr.grad(x) for x in film_terms]
         if tail is not None:
             with dr.suspend_grad():
-                tangent += replay(self, mode, *tail, mi.Spectrum(0), mi.Vector3f(dr.grad(last)))
+                tangent += replay(self, mode, *tail, adjoint=mi.Spectrum(0),
+                                  p_tangent=mi.Vector3f(dr.grad(last)))
         return on_sample(tangent, alpha_tangent, []), film_tangents
 
     def _first_vertices(

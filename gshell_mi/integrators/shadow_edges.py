@@ -44,7 +44,7 @@ class ShadowSamples:
     def take(self, index: mi.UInt32) -> ShadowSamples:
         """The samples with the given indices."""
         arrays = [None if x is None else dr.gather(type(x), x, index) for x in self.arrays()]
-        return ShadowSamples(*arrays, self.emitter, self.is_point)
+        return ShadowSamples(*arrays, emitter=self.emitter, is_point=self.is_point)
 
     def arrays(self) -> list[AnyArray | None]:
         """What there is one of per sample."""

@@ -141,6 +141,6 @@ def _over(image: np.ndarray, above: np.ndarray) -> np.ndarray:
 
 
 def _denoised(color: np.ndarray) -> np.ndarray:
-    import mitsuba_oidn
+    import mitsuba_oidn  # pyright: ignore[reportMissingImports]  # an extra
 
     return np.asarray(mitsuba_oidn.denoise(np.ascontiguousarray(color, np.float32), hdr=True))

@@ -58,7 +58,7 @@ def _write_film(frames: Iterable[np.ndarray], path: Path, fps: float, *, keep: b
             pixels = np.ascontiguousarray((np.clip(frame, 0, 1) * 255 + 0.5).astype(np.uint8))
             if sink is None:
                 sink = stack.enter_context(_ffmpeg(path, pixels.shape[1::-1], fps))
-            sink.write(pixels)
+            sink.write(pixels.data)
             if keep:
                 pictures.append(Image.fromarray(pixels).quantize(128))
     return pictures
@@ -86,6 +86,7 @@ def _ffmpeg(path: Path, size: tuple[int, int], fps: float) -> Iterator[BinaryIO]
         broken = False
         try:
             try:
+                assert process.stdin is not None, "it is a pipe"
                 yield process.stdin
                 process.stdin.close()
             except BrokenPipeError:  # it has ended before; why, it says below
