@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 
 from ..arrays import UInt32
-from ..lattice import MISSING
+from ..lattice import MISSING, BccLattice
 from ..lattice.sign_words import is_set
 from . import tet_tables as tables
 from .grid_extraction import ActiveCells
@@ -43,6 +43,7 @@ class BccExtraction(TetExtraction):
     def _lone(self, cell: UInt32) -> UInt32:
         """Bit d: the edge to corner d belongs to no tetrahedron. So it is with the outermost rows of each
         grid on the side where the other grid does not reach beyond it, and with two half diagonals."""
+        assert isinstance(self.lattice, BccLattice), "its fields do not fit in blocks"
         x, y, z = self.lattice.coordinates(cell)
         second, last = cell >= self.stride * self.stride * self.stride, self.stride - 1
         end = dr.select(second, last, 0)
