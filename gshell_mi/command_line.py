@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import tyro
 
@@ -13,7 +13,12 @@ from .doctor import ensure_variant
 from .interrupt import Interrupt
 from .streams import with_streams
 
-Arguments = TypeVar("Arguments")
+
+class _Arguments(Protocol):
+    variant: str
+
+
+Arguments = TypeVar("Arguments", bound=_Arguments)
 
 
 def run_command(name: str, description: str, arguments: type[Arguments], work: Callable[[Arguments], None],

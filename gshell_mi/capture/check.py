@@ -157,7 +157,9 @@ class _Sheet:
         size = (max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
         brightest = max(np.quantile(rgba[..., :3], 0.995), 1e-6)
         exposed = rgba[..., :3] / max(brightest, 1.0) + (1 - rgba[..., 3:]) * 0.15
-        known = self.scene.targets[index].known[..., None]
+        known = self.scene.targets[index].known
+        assert known is not None, "targets fill it in"
+        known = known[..., None]
         exposed = known * exposed + (1 - known) * (0.4 * exposed + 0.6 * np.array(_UNKNOWN))
         image = Image.fromarray((srgb(exposed) * 255).astype(np.uint8)).resize(size, Image.Resampling.BOX)
         camera = camera.resized(*size)

@@ -154,7 +154,7 @@ class _Patches:
     def __init__(self, values: np.ndarray, faces: np.ndarray):
         self.positive = values > 0
         self.of_vertex = equal_patches(self.positive, faces)
-        self.size = np.bincount(self.of_vertex)
+        self.size: np.ndarray = np.bincount(self.of_vertex)
 
     def specks(self, wanted: np.ndarray) -> np.ndarray:
         """Which vertices lie in patches that are too small, or mostly of a sign that they should not have."""

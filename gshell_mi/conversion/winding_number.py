@@ -27,7 +27,9 @@ def winding_number(grid: CubicGrid, mesh: trimesh.Trimesh) -> np.ndarray:
         for axis in range(3):
             density[:, axis] += np.bincount(index, weight * area_normals[:, axis], n**3)
     density = density.reshape(n, n, n, 3) / h**3  # indexed [z, y, x]
-    divergence = sum(np.gradient(density[..., axis], h, axis=2 - axis) for axis in range(3))
+    divergence = np.zeros((n, n, n))
+    for axis in range(3):
+        divergence += np.gradient(density[..., axis], h, axis=2 - axis)
     if n < 3:
         return np.zeros(n**3)
     inner = slice(1, -1)

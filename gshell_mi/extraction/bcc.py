@@ -51,7 +51,10 @@ class BccExtraction(TetExtraction):
         along_z, along_y, along_x = at_x & at_y, at_x & at_z, at_y & at_z
         in_corner = ~second & ((x + y + z == 0) | (x + y + z == 3 * last))
         bits = ((along_z, 0b011), (along_y, 0b101), (along_x, 0b110), (in_corner, 0b111))
-        return sum((dr.select(lone, self.uint_t(1 << corner), 0) for lone, corner in bits), self.uint_t(0))
+        lone = self.uint_t(0)
+        for outermost, corner in bits:
+            lone |= dr.select(outermost, self.uint_t(1 << corner), 0)
+        return lone
 
     def active_tets(self, cells: ActiveCells) -> UInt32:
         existing = dr.gather(self.uint_t, self.uint_t(existing_tets_table()), cells.border)

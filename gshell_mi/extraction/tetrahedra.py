@@ -129,7 +129,7 @@ class TetExtraction(MarchingExtraction[_Polygons]):
             dr.scatter(local, polygons.corners[i], slot + i, mode=dr.ReduceMode.Permute)
             dr.scatter(local, kept_opaque + cut_vertex, slot + 4 + i, cuts[i], mode=dr.ReduceMode.Permute)
 
-        kept = sum((dr.select(stay, self.uint_t(1 << i), 0) for i, stay in enumerate(stays)), self.uint_t(0))
+        kept = sum(dr.select(stay, self.uint_t(1 << i), 0) for i, stay in enumerate(stays))
         entry = dr.gather(
             self.uint_t,
             self.uint_t(tables.clip_table()),

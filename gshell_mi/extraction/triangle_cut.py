@@ -24,7 +24,7 @@ def cut_triangles(faces: Array3u, names: Array3u, name_count: int,
     uint_t = type(faces.x)
     kept_opaque = dr.opaque(uint_t, kept_count)
     stays = [corner < kept_opaque for corner in faces]
-    number = sum((dr.select(stay, uint_t(1), 0) for stay in stays), uint_t(0))
+    number = sum(dr.select(stay, uint_t(1), 0) for stay in stays)
     dr.eval(number)
     whole, mixed = dr.compress(number == 3), dr.compress((number == 1) | (number == 2))
     result = _take(faces, whole)

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import imageio_ffmpeg
 import numpy as np
@@ -65,7 +65,7 @@ def _write_film(frames: Iterable[np.ndarray], path: Path, fps: float, *, keep: b
 
 
 @contextmanager
-def _ffmpeg(path: Path, size: tuple[int, int], fps: float) -> Iterator[BinaryIO]:
+def _ffmpeg(path: Path, size: tuple[int, int], fps: float) -> Iterator[IO[bytes]]:
     """Takes 8-bit RGB frames of ``size`` (width, height); at the end, the MP4 is whole.
 
     Raises:

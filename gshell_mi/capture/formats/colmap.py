@@ -124,12 +124,12 @@ def _camera(model: str, width: int, height: int, p: np.ndarray, pose: np.ndarray
     if model == "SIMPLE_PINHOLE":
         return Camera(width, height, p[0], p[0], p[1], p[2], pose)
     if model == "PINHOLE":
-        return Camera(width, height, *p[:4], pose=pose)
+        return Camera(width, height, *p[:4], to_world=pose)
     if model == "SIMPLE_RADIAL":
         return Camera(width, height, p[0], p[0], p[1], p[2], pose, Distortion(p[3]))
     if model == "RADIAL":
         return Camera(width, height, p[0], p[0], p[1], p[2], pose, Distortion(p[3], p[4]))
-    return Camera(width, height, *p[:4], pose=pose, distortion=Distortion(*p[4:]))
+    return Camera(width, height, *p[:4], to_world=pose, distortion=Distortion(*p[4:]))
 
 
 def _check_model(model: str, path: Path) -> None:
