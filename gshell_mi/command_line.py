@@ -15,7 +15,8 @@ from .streams import with_streams
 
 
 class _Arguments(Protocol):
-    variant: str
+    @property
+    def variant(self) -> str: ...
 
 
 Arguments = TypeVar("Arguments", bound=_Arguments)

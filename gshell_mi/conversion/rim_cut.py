@@ -121,7 +121,7 @@ def _rim_distance(
         low = np.clip(np.floor((vertices - grid.origin) / h).astype(int), 0, grid.stride - 2)
         corners.append(grid.first + (low @ strides)[:, None] + cube)
     candidates = nearest[np.concatenate(corners, axis=1)]
-    known = (candidates >= 0).any(axis=1)
+    known = np.asarray((candidates >= 0).any(axis=1))
     candidates = np.where(candidates >= 0, candidates, candidates.max(axis=1, keepdims=True))
     feet = feet_of(vertices[known].astype(float), candidates[known])
     inner = rims.query(feet.point)[0]
