@@ -11,18 +11,7 @@ import griffe
 
 def shown(text: str) -> str:
     """A docstring with its doctests as code, and what is returned as a paragraph: it is told in prose here,
-    whose first colon does not end a type.
-
-    >>> print(shown("Doubles.\\n\\nReturns:\\n    So much: twice as much.\\n\\n>>> twice(2)\\n4"))
-    Doubles.
-    <BLANKLINE>
-    **Returns:** So much: twice as much.
-    <BLANKLINE>
-    ```pycon
-    >>> twice(2)
-    4
-    ```
-    """
+    whose first colon does not end a type."""
     text = re.sub(r"^Returns:\n((?:    .*(?:\n|$))+)",
                   lambda found: f"**Returns:** {textwrap.dedent(found[1])}", text, flags=re.M)
     lines: list[str] = []
