@@ -25,7 +25,7 @@ OWN_FILES = {"index.md": "README.md", "contributing.md": "CONTRIBUTING.md", "cha
 LIBRARY = {
     "lattice": ("Lattices", "Where the fields live.", ["lattice", "arrays", "bricks"]),
     "fields": ("Fields", "Signed distances on a lattice, and how they begin.",
-               ["fields", "parametrisation", "activations"]),
+               ["fields", "template", "parametrisation", "activations"]),
     "extraction": ("Extraction", "From fields to meshes, with derivatives.", ["extraction"]),
     "mesh": ("Meshes", "From meshes back to fields; what meshes are like.",
              ["conversion", "mesh_files", "topology", "triangles", "visibility", "diagnostics"]),
@@ -34,18 +34,18 @@ LIBRARY = {
                     ["integrators.gshell_path", "integrators.gshell_mask", "integrators"]),
     "capture": ("Capture", "From photographs to fit scenes.", ["capture"]),
     "scene": ("Fit scenes", "What a fit starts from, and files that anybody may have written.",
-              ["scene", "targets", "views", "scene_files", "scene_inputs", "images", "float_images",
+              ["scene", "targets", "views", "pixels", "scene_files", "scene_inputs", "images", "float_images",
                "environment_maps", "json_files"]),
     "fit": ("Fit", "From scenes to surfaces, materials and light.", ["fit"]),
     "losses": ("Losses, material, light", "What a fit minimises, and what it changes beside the surface.",
-               ["losses", "means", "material", "light", "texture", "color_detail", "schedules", "outliers",
-                "tempered_adam"]),
+               ["losses", "means", "material", "light", "extras", "texture", "color_detail", "schedules",
+                "outliers", "tempered_adam"]),
     "evaluation": ("Evaluation", "How good a result is.", ["evaluation", "compare"]),
     "export": ("Export", "What a fit leaves behind, and what can be made of it.",
                ["export", "turntable", "report", "viewer"]),
     "commands": ("Commands and machine", "What the commands share, and what the machine can do.",
                  ["command_line", "streams", "interrupt", "errors", "files", "own_folder", "memory", "timing",
-                  "wording", "doctor"]),
+                  "wording", "progress", "doctor"]),
 }
 
 #: Packages of which only the modules right inside are described: what lies deeper may change.
@@ -73,12 +73,10 @@ def modules_of(page: str) -> list[str]:
 
 
 def exports(package: Path) -> list[str]:
-    """The names in the ``__all__`` of a package, but those that a module of it has, too."""
-    for statement in ast.parse((package / "__init__.py").read_text()).body:
-        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "__all__":
-            names = ast.literal_eval(statement.value)
-            return [name for name in names if not (package / f"{name}.py").exists()]
-    return []
+    """The names that a package imports from its modules, but those that a module of it has, too."""
+    names = [name.name for statement in ast.parse((package / "__init__.py").read_text()).body
+             if isinstance(statement, ast.ImportFrom) and statement.level for name in statement.names]
+    return [name for name in names if not (package / f"{name}.py").exists()]
 
 
 def library_page(page: str) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 import drjit as dr
 import pytest
 import trimesh
+import tyro
 from bowl import SHORT
 
 from gshell_mi.fit import FitConfig
@@ -20,10 +21,7 @@ SMALLER = {"TetLattice(64)": "TetLattice(24)", "TetLattice(48)": "TetLattice(16)
 
 def short_config() -> FitConfig:
     """The options of a short fit, as settings."""
-    options = [option for option in SHORT if option != "--no-report"]
-    names = [option[2:].replace("-", "_") for option in options[::2]]
-    kinds = {name: type(getattr(FitConfig(), name)) for name in names}
-    return FitConfig(**{name: kinds[name](value) for name, value in zip(names, options[1::2], strict=True)})
+    return tyro.cli(FitConfig, args=[option for option in SHORT if option != "--no-report"])
 
 
 def example(number: int, variant: str) -> str:
