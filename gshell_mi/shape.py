@@ -219,7 +219,9 @@ class GShell(mi.Mesh):
             neutral, given = dr.zeros(mi.Float, lattice.weight_count), fields.weights
             values["weights"] = neutral if given is None else mi.Float(given)
         mesh = extract(lattice, **values, template=template)
-        return self._in_world(mesh.template if template else mesh)
+        wanted = mesh.template if template else mesh
+        assert wanted is not None, "it was asked for"
+        return self._in_world(wanted)
 
     @property
     def cell_size(self) -> float:
