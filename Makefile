@@ -1,7 +1,8 @@
 # make fit      set everything up and reconstruct SCENE (default scenes/tshirt.xml) into OUT
-# make test     set everything up, check the style and run the tests
+# make test     set everything up, check the style and the types, and run the tests
 # make regress  fit every scene with default settings and compare with the stored results
 # make scenes   rebuild the scenes from code
+# make docs     build the documentation into build/site
 # make fuzz     try damaged inputs of every kind, for ten minutes
 
 SHELL := /bin/bash
@@ -17,17 +18,19 @@ PY := $(VENV)/bin/python
 # BLAS threads and Dr.Jit's thread pool fight for the same cores.
 export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help fit test regress scenes fuzz clean
+.PHONY: help fit test regress scenes docs fuzz clean
 
 help:
-	@sed -n 's/^# //p' Makefile | head -5
+	@sed -n 's/^# //p' Makefile | head -6
 
 fit: $(VENV)/.llvm
 	@$(PY) -m gshell_mi.fit $(SCENE) -o $(OUT) --overwrite $(ARGS)
 
 test: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) -m ruff check --quiet .
+	@$(PY) -m basedpyright --pythonpath $(PY)
 	@$(PY) -m pytest $(ARGS)
 
 regress: $(VENV)/.test $(VENV)/.llvm
@@ -35,6 +38,9 @@ regress: $(VENV)/.test $(VENV)/.llvm
 
 scenes: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) pipelines/make_scenes.py $(ARGS)
+
+docs: $(VENV)/.docs
+	@$(PY) -m mkdocs build --quiet --strict $(ARGS)
 
 fuzz: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) pipelines/fuzz.py $(ARGS)
@@ -51,6 +57,11 @@ $(VENV)/.package: $(PY) pyproject.toml
 $(VENV)/.test: $(VENV)/.package
 	@echo "Installing the tests' tools into $(VENV) ..."
 	@$(PY) -m pip install --quiet --editable '.[test]'
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.package
+	@echo "Installing the documentation's tools into $(VENV) ..."
+	@$(PY) -m pip install --quiet --editable '.[docs]'
 	@touch $@
 
 # Dr.Jit's wheels leave two libraries to the system: libatomic, and LLVM, which they load when first used.

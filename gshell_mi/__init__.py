@@ -20,6 +20,7 @@ The rooms, in the order in which data flows through them:
   files that anybody may have written, read with care
 - ``command_line``, ``streams``, ``interrupt``, ``errors``, ``files``, ``own_folder``, ``memory``: what the
   commands share; ``doctor``: whether this machine can run it all
+- ``arrays``: names of Dr.Jit arrays in annotations
 - ``compat``, ``plugins``: what depends on Mitsuba's version, and how its plugins are registered
 
 Importing the package sets no variant; its plugins register for the variant in use and for every later one.

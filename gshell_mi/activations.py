@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import numpy as np
 
+from .arrays import ArrayT
 
-def sigmoid(x: Any) -> Any:
+
+def sigmoid(x: ArrayT) -> ArrayT:
     """``1 / (1 + exp(-x))``, in (0, 1), of a Dr.Jit array.
 
     >>> import mitsuba as mi
@@ -18,7 +18,7 @@ def sigmoid(x: Any) -> Any:
     return dr.rcp(1 + dr.exp(-x))
 
 
-def softplus(x: Any) -> Any:
+def softplus(x: ArrayT) -> ArrayT:
     """``log(1 + exp(x))``, positive, of a Dr.Jit array; never overflows.
 
     >>> import mitsuba as mi

@@ -126,7 +126,8 @@ class Lookup:
         for index in range(8):
             steps = index & 1, index >> 1 & 1, index >> 2
             place = (dr.clip(c + step, 0, last) for c, step in zip(corner, steps, strict=True))
-            voxel = self.voxel(*place, active)
+            x, y, z = place
+            voxel = self.voxel(x, y, z, active)
             weight = mi.Float(1)
             for p, step in zip(part, steps, strict=True):
                 weight = weight * (p if step else 1 - p)

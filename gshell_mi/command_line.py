@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import TypeVar
+from functools import partial
+from typing import Protocol, TypeVar
 
 import tyro
 
@@ -12,7 +13,13 @@ from .doctor import ensure_variant
 from .interrupt import Interrupt
 from .streams import with_streams
 
-Arguments = TypeVar("Arguments")
+
+class _Arguments(Protocol):
+    @property
+    def variant(self) -> str: ...
+
+
+Arguments = TypeVar("Arguments", bound=_Arguments)
 
 
 def run_command(name: str, description: str, arguments: type[Arguments], work: Callable[[Arguments], None],
@@ -37,9 +44,9 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
     """
     def run() -> int:
         check(sys.argv[1:] if given is None else given)
-        parsed = tyro.cli(arguments, args=given, prog=f"python -m gshell_mi.{name}", description=description,
-                          config=(tyro.conf.FlagCreatePairsOff,),
-                          **({} if default is None else {"default": default}))
+        parse = partial(tyro.cli, arguments, args=given, prog=f"python -m gshell_mi.{name}",
+                        description=description, config=(tyro.conf.FlagCreatePairsOff,))
+        parsed = parse() if default is None else parse(default=default)
         with Interrupt() as interrupt:
             try:
                 ensure_variant(parsed.variant)

@@ -83,17 +83,18 @@ def environment_radiance(emitter: mi.Emitter) -> np.ndarray:
     return np.array(parameters["data"])[:, 1:-1, :3] * np.array(parameters["scale"]).ravel()
 
 
-def init_mesh(mesh: Any, props: Any, has_vertex_normals: bool) -> None:
+def init_mesh(mesh: mi.Mesh, props: mi.Properties, has_vertex_normals: bool) -> None:
     """Constructs a Python subclass of ``mi.Mesh`` as one triangle, to be filled by ``write_mesh``."""
     mi.Mesh.__init__(mesh, props.plugin_name(), 3, 1, props, has_vertex_normals)
 
 
-def to_world(props: Any) -> mi.ScalarTransform4f:
+def to_world(props: mi.Properties) -> mi.ScalarTransform4f:
     """The property ``to_world``, which Mitsuba hands out in double precision, or the identity."""
     return mi.ScalarTransform4f(props.get("to_world", mi.ScalarTransform4f()).matrix)
 
 
-def write_mesh(mesh: Any, positions: Any, faces: Any, normals: Any = None, **attributes: Any) -> list[str]:
+def write_mesh(mesh: mi.Mesh, positions: mi.Float, faces: mi.UInt32, normals: mi.Float | None = None,
+               **attributes: mi.Float) -> list[str]:
     """Replaces the buffers of a mesh, whose sizes may change, and lets it update itself.
 
     Args:
@@ -108,7 +109,7 @@ def write_mesh(mesh: Any, positions: Any, faces: Any, normals: Any = None, **att
     return write_parameters(mesh, values | attributes)
 
 
-def write_parameters(node: Any, values: Mapping[str, Any]) -> list[str]:
+def write_parameters(node: mi.Object, values: Mapping[str, Any]) -> list[str]:
     """Replaces those parameters of a mesh or scene that are named, and lets it update itself."""
     params = mi.traverse(node)
     for name, value in values.items():
@@ -116,7 +117,7 @@ def write_parameters(node: Any, values: Mapping[str, Any]) -> list[str]:
     return params.update()
 
 
-def drop_vertex_normals(mesh: Any) -> None:
+def drop_vertex_normals(mesh: mi.Mesh) -> None:
     """Leaves a mesh without vertex normals, so that it is shaded with those of its faces."""
     write_parameters(mesh, {"vertex_normals": mi.Float([])})
 

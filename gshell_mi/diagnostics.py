@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arrays import ArrayT
 from .compat import mesh_scene
 from .topology import topology, vertex_components
 from .triangles import area_vectors, unit
@@ -61,7 +62,7 @@ class Diagnostics:
         if self.self_contact > CONTACT_LIMIT:
             found.append(f"{100 * self.self_contact:.0f} % of the surface is within a cell of another sheet "
                          f"of its template, where details merge: raise --resolution.")
-        if self.unobserved > UNOBSERVED_LIMIT:
+        if self.unobserved > UNOBSERVED_LIMIT and self.unobserved_center:
             x, y, z = self.unobserved_center
             found.append(f"{100 * self.unobserved:.0f} % of the surface is seen by no view and is a guess: "
                          f"add views of the parts around ({x:.2f}, {y:.2f}, {z:.2f}).")
@@ -101,7 +102,8 @@ def diagnose(surface: tuple[np.ndarray, np.ndarray], template: tuple[np.ndarray,
     touching = _touching(centers, normals, template, cell)
     unseen = area * (best_view(centers, normals, surface, views) == 0)
     total = max(area.sum(), 1e-30)
-    center = tuple(float(x) for x in unseen @ centers / unseen.sum()) if unseen.any() else None
+    x, y, z = unseen @ centers / max(unseen.sum(), 1e-30)
+    center = (float(x), float(y), float(z)) if unseen.any() else None
     return Diagnostics(counts.components - floaters, floaters, counts.boundary_loops, counts.pinholes,
                        float(area[touching].sum() / total), float(unseen.sum() / total), center)
 
@@ -126,5 +128,5 @@ def _touching(centers: np.ndarray, normals: np.ndarray, template: tuple[np.ndarr
     return touching
 
 
-def _vectors(kind: type, rows: np.ndarray):
+def _vectors(kind: type[ArrayT], rows: np.ndarray) -> ArrayT:
     return kind(np.ascontiguousarray(rows.T, np.float32))

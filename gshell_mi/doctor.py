@@ -206,7 +206,8 @@ def _render() -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> int:
     """The command; exit code 2 if the llvm variant cannot run."""
-    parser = argparse.ArgumentParser(prog="python -m gshell_mi.doctor", description=__doc__.split("\n")[0])
+    description = (__doc__ or "").split("\n")[0]
+    parser = argparse.ArgumentParser(prog="python -m gshell_mi.doctor", description=description)
     parser.add_argument("--llvm", action="store_true", help="check LLVM only, without a render or report")
     parser.add_argument("--render", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args(argv)

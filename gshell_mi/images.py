@@ -32,7 +32,7 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
     >>> round(psnr(np.zeros(4), np.full(4, 0.1)), 2)
     20.0
     """
-    return decibels(np.mean((image - reference) ** 2))
+    return decibels(float(np.mean((image - reference) ** 2)))
 
 
 def decibels(squared_error: float) -> float:

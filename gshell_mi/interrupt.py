@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from types import FrameType
 
 from .streams import leave
 
@@ -31,7 +32,7 @@ class Interrupt:
                 self._outer = outer
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._previous is not None:
             signal.signal(signal.SIGINT, self._previous)
 
@@ -45,7 +46,7 @@ class Interrupt:
         if self.pending:
             raise KeyboardInterrupt
 
-    def _handle(self, number: int, frame) -> None:
+    def _handle(self, number: int, frame: FrameType | None) -> None:
         self._pending = True
         signal.default_int_handler(number, frame)
 

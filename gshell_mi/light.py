@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -48,7 +49,8 @@ class EnvironmentLight:
         if "data" not in parameters:
             return None
         radiance = environment_radiance(emitter)
-        shrunk = resize(radiance, (height, 2 * height, 3), order=1, anti_aliasing=radiance.shape[0] > height)
+        shrunk: Any = resize(radiance, (height, 2 * height, 3), order=1,
+                             anti_aliasing=radiance.shape[0] > height)
         return cls(shrunk, mi.ScalarTransform4f(np.array(parameters["to_world"].matrix).reshape(4, 4)))
 
     @property

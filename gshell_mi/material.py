@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .activations import sigmoid
 from .fields.carried import Carried
@@ -113,14 +116,14 @@ def principled(base_color: mi.Texture | None = None) -> dict:
     Args:
         base_color: another texture for the base colour.
     """
-    textures = {parameter: {"type": "mesh_attribute", "name": attribute}
+    textures: dict[str, Any] = {parameter: {"type": "mesh_attribute", "name": attribute}
                 for attribute, parameter in ATTRIBUTES.items()}
     if base_color is not None:
         textures["base_color"] = base_color
     return {"type": "twosided", "bsdf": {"type": "principled", **textures}}
 
 
-def _logit(x):
+def _logit(x: ArrayLike) -> np.ndarray:
     # Saturated values would have no gradient left.
     x = np.clip(x, 0.02, 0.98)
     return np.log(x / (1 - x))

@@ -9,8 +9,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .arrays import AnyArray
 
-def mean(x) -> mi.Float:
+
+def mean(x: AnyArray) -> mi.Float:
     """Mean over every entry of an array, colour or tensor; 0 if there is none, as of a mesh without faces."""
     flat = dr.ravel(x) if not dr.is_tensor_v(x) else x.array
     count = dr.width(flat)

@@ -53,7 +53,7 @@ def free_gpu_memory() -> int | None:
 
 def free_memory_of_variant() -> int | None:
     """Bytes free where the arrays of the current Mitsuba variant live."""
-    return free_gpu_memory() if mi.variant().startswith("cuda") else free_memory()
+    return free_gpu_memory() if (mi.variant() or "").startswith("cuda") else free_memory()
 
 
 def peak_memory() -> int:

@@ -9,7 +9,7 @@ Mitsuba's own folder in front. See docs/security.md.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from xml.parsers import expat
@@ -84,7 +84,8 @@ class _Enough(Exception):
     """What is looked for has been found."""
 
 
-def _parse(path: Path, started, ended=None) -> None:
+def _parse(path: Path, started: Callable[[str, dict[str, str]], None],
+           ended: Callable[[str], None] | None = None) -> None:
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = started, ended
     parser.Parse(path.read_bytes(), True)
@@ -141,7 +142,7 @@ def _resolving_beside(path: Path) -> Iterator[None]:
 
 def _check_plugin(name: str) -> None:
     # Names that are registered in Python for this variant are found without a search for a file.
-    registered = () if mi.variant().startswith("scalar") else (*OWN_PLUGINS, *MITSUBA_INTEGRATORS)
+    registered = () if (mi.variant() or "").startswith("scalar") else (*OWN_PLUGINS, *MITSUBA_INTEGRATORS)
     native = re.fullmatch(r"\w+", name) and any((mitsuba_folder() / "plugins").glob(f"{name}.*"))
     if name not in ("scene", *registered) and not native:
         raise ValueError(f"it names a plugin '{name}', which neither Mitsuba nor gshell_mi has; scenes may "

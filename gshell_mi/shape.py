@@ -1,5 +1,7 @@
 """The ``gshell`` shape plugin: a Mitsuba mesh that is extracted from fields on a lattice."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from typing import Any
 
@@ -8,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import compat, memory
+from .arrays import ArrayT
 from .conversion import from_mesh
 from .errors import UserError
 from .extraction import SurfaceMesh, extract
@@ -30,37 +33,35 @@ _LARGE = 200
 class GShell(mi.Mesh):
     """G-Shell (``gshell``): the surface ``{sdf = 0, msdf >= 0}`` of fields on a lattice.
 
-    ======================  =================================================================
-    ``resolution``          integer: cells per side of the lattice (default: that of the file, or 64)
-    ``grid``                string: ``tet`` (default), ``cube``, ``flexicubes`` or ``bcc``, see ``lattice``
-    ``to_world``            transform: maps the lattice's cube [-1, 1]^3 to the world
-    ``filename``            string: initial fields: an .npz with ``sdf`` and, if wanted, ``msdf`` and
-                            ``deform``, or a mesh file in world space (default: a sphere of radius 0.5
-                            in lattice units)
-    ``band``                boolean: keep the fields in blocks around the surface only, so that memory
-                            grows with the square of the resolution (default: false)
-    ``face_normals``        boolean: shade with face normals (default: false, smooth normals)
-    (nested)                bsdf: the material
-    ======================  =================================================================
+    Plugin parameters:
+
+    * ``resolution`` (int): cells per side of the lattice (default: that of the file, or 64).
+    * ``grid`` (string, default ``tet``): ``tet``, ``cube``, ``flexicubes`` or ``bcc``, see ``lattice``.
+    * ``to_world`` (transform): maps the lattice's cube [-1, 1]^3 to the world.
+    * ``filename`` (string): initial fields: an .npz with ``sdf`` and, if wanted, ``msdf`` and ``deform``, or
+      a mesh file in world space (default: a sphere of radius 0.5 in lattice units).
+    * ``band`` (bool, default false): keep the fields in blocks around the surface only, so that memory grows
+      with the square of the resolution.
+    * ``face_normals`` (bool, default false): shade with face normals instead of smooth ones.
+    * a nested ``bsdf``: the material.
 
     ``mi.traverse`` shows, beside the parameters of a mesh:
 
-    ======================  =================================================================
-    ``sdf``, ``msdf``       one value per lattice vertex, in lattice units; with ``band`` per stored
-                            vertex of ``lattice``, a ``BlockLattice``, and so the others
-    ``deform``              three values per lattice vertex; 1 is the greatest offset that rules out
-                            self-intersection, beyond it they are clipped
-    ``weights``             with ``flexicubes`` only: 21 values per cube, 0 is neutral, see ``extract``
-    ``lattice_<name>``      the lattice field of the mesh attribute ``<name>``, after
-                            ``attach_attribute``
-    ======================  =================================================================
+    * ``sdf``, ``msdf``: one value per lattice vertex, in lattice units; with ``band`` per stored vertex of
+      ``lattice``, a ``BlockLattice``, and so the others.
+    * ``deform``: three values per lattice vertex; 1 is the greatest offset that rules out self-intersection,
+      beyond it they are clipped.
+    * ``weights``: with ``flexicubes`` only: 21 values per cube, 0 is neutral, see ``extract``.
+    * ``lattice_<name>``: the lattice field of the mesh attribute ``<name>``, after ``attach_attribute``.
 
     When any of them changes, ``params.update()`` extracts the mesh anew; derivatives of its vertices,
     normals and attributes lead back to the fields. Vertex and face buffers are padded to sizes from a
     geometric ladder, as the kernels of a renderer contain buffer sizes: trailing faces are ``(0, 0, 0)``
     and trailing vertices copies of the first. ``surface`` is the mesh without padding.
 
-    XML: ``<shape type="gshell" id="subject"><integer name="resolution" value="64"/></shape>``
+    ```xml
+    <shape type="gshell" id="subject"> <integer name="resolution" value="64"/> </shape>
+    ```
 
     >>> import mitsuba as mi
     >>> scene = mi.load_dict({"type": "scene", "subject": {"type": "gshell", "resolution": 16}})
@@ -92,7 +93,7 @@ class GShell(mi.Mesh):
         band = props.get("band", False)
         self.to_world = compat.to_world(props)
         compat.init_mesh(self, props, has_vertex_normals=smooth)
-        self._attributes: dict[str, tuple[Any, int]] = {}
+        self._attributes: dict[str, tuple[mi.Float, int]] = {}
         self._mirrored = bool(np.linalg.det(np.array(self.to_world.matrix)[:3, :3]) < 0)
         self.set_fields(_initial_fields(self.filename, grid, resolution, self.to_world, band))
         # Mitsuba merges the meshes of a scene that have equal materials into plain ones, but for those with
@@ -118,7 +119,7 @@ class GShell(mi.Mesh):
         else:
             super().parameters_changed(keys)
 
-    def attach_attribute(self, name: str, field: Any) -> None:
+    def attach_attribute(self, name: str, field: mi.Float) -> None:
         """Gives the mesh a vertex attribute that is interpolated from a lattice field.
 
         The field appears in ``mi.traverse`` as ``lattice_<name>`` and a ``mesh_attribute`` texture reads
@@ -167,7 +168,7 @@ class GShell(mi.Mesh):
 
     def fields(self) -> LatticeFields:
         """A copy of the present fields on the host."""
-        arrays = {name: np.array(dr.detach(getattr(self, name))) for name in self.field_names}
+        arrays: dict[str, Any] = {name: np.array(dr.detach(getattr(self, name))) for name in self.field_names}
         if isinstance(self.lattice, BlockLattice):
             arrays |= {"blocks": self.lattice.blocks.numpy(), "block_resolution": self.lattice.resolution}
         return LatticeFields(grid=self.lattice.grid, **arrays)
@@ -184,10 +185,10 @@ class GShell(mi.Mesh):
         Returns:
             What brings an optimiser's state to the new blocks; None if the blocks stay.
         """
-        before = self.lattice
-        if not isinstance(before, BlockLattice) or (not rescan and before.covers(self.surface.cells)):
+        before, cells = self.lattice, self.surface.cells
+        if not isinstance(before, BlockLattice) or cells is None or (not rescan and before.covers(cells)):
             return None
-        carried = Carried.following(before, self.surface.cells, self.sdf, keep=not rescan)
+        carried = Carried.following(before, cells, self.sdf, keep=not rescan)
         if carried.is_identity:
             return None
         params = mi.traverse(self)
@@ -201,7 +202,9 @@ class GShell(mi.Mesh):
 
     def template(self) -> SurfaceMesh:
         """The watertight template of the present fields, in world space."""
-        return self._in_world(extract(self.lattice, **self._fields(), template=True).template)
+        template = extract(self.lattice, **self._fields(), template=True).template
+        assert template is not None, "it was asked for"
+        return self._in_world(template)
 
     def surface_of(self, fields: LatticeFields, *, template: bool = False) -> SurfaceMesh:
         """The surface of other fields in this shape's place, in world space; the shape stays as it is.
@@ -216,7 +219,9 @@ class GShell(mi.Mesh):
             neutral, given = dr.zeros(mi.Float, lattice.weight_count), fields.weights
             values["weights"] = neutral if given is None else mi.Float(given)
         mesh = extract(lattice, **values, template=template)
-        return self._in_world(mesh.template if template else mesh)
+        wanted = mesh.template if template else mesh
+        assert wanted is not None, "it was asked for"
+        return self._in_world(wanted)
 
     @property
     def cell_size(self) -> float:
@@ -233,7 +238,7 @@ class GShell(mi.Mesh):
         """The parameters that make the surface: ``weights`` are among them with FlexiCubes only."""
         return _FIELDS if self.lattice.weight_count else _FIELDS[:3]
 
-    def _fields(self) -> dict[str, Any]:
+    def _fields(self) -> dict[str, mi.Float]:
         return {name: getattr(self, name) for name in self.field_names}
 
     def _in_world(self, surface: SurfaceMesh) -> SurfaceMesh:
@@ -265,7 +270,7 @@ class GShell(mi.Mesh):
             **self._mesh_attributes(vertices),
         )
 
-    def _mesh_attributes(self, vertices: "_Padding") -> dict[str, Any]:
+    def _mesh_attributes(self, vertices: _Padding) -> dict[str, mi.Float]:
         return {
             name: dr.ravel(vertices.apply(self.surface.interpolate(field, channels)))
             for name, (field, channels) in self._attributes.items()
@@ -286,7 +291,7 @@ class _Padding:
         step = max(1 << max(count - 1, 0).bit_length() - 3, 16) if count > 4 else 16
         self.size = max(-(-count // step) * step, step)
 
-    def apply(self, values: Any, fill_with_zero: bool = False) -> Any:
+    def apply(self, values: ArrayT, fill_with_zero: bool = False) -> ArrayT:
         if self.count == 0:
             return dr.zeros(type(values), self.size)
         index = dr.arange(mi.UInt32, self.size)
@@ -295,7 +300,7 @@ class _Padding:
         return dr.select(exists, padded, 0) if fill_with_zero else padded
 
 
-def _initial_fields(filename: str, grid: str, resolution: int | None, to_world: Any,
+def _initial_fields(filename: str, grid: str, resolution: int | None, to_world: mi.ScalarTransform4f,
                     band: bool) -> LatticeFields:
     lattice = make_lattice(grid, 64 if resolution is None else resolution)
     if lattice.resolution > _LARGE and not band:

@@ -10,8 +10,8 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable
-from typing import TextIO
+from collections.abc import Callable, Iterable
+from typing import Any, TextIO
 
 from .errors import UserError
 
@@ -45,7 +45,7 @@ def _runs_command() -> bool:
     return re.fullmatch(r"gshell-[a-z]+(\.exe)?", os.path.basename(started)) is not None
 
 
-def leave(*_) -> None:
+def leave(*_: object) -> None:
     """A handler of signals: says that it was interrupted, and ends the process."""
     with contextlib.suppress(OSError):
         os.write(2, b"Interrupted.\n")
@@ -63,24 +63,24 @@ class Forgiving:
         self._stream, self.error = stream, None
 
     def write(self, text: str) -> int:
-        self._try(lambda: self._stream.write(text))
+        self._try(lambda stream: stream.write(text))
         return len(text)
 
-    def writelines(self, lines) -> None:
+    def writelines(self, lines: Iterable[str]) -> None:
         for line in lines:
             self.write(line)
 
     def flush(self) -> None:
-        self._try(lambda: self._stream.flush())
+        self._try(lambda stream: stream.flush())
 
-    def __getattr__(self, name: str):
+    def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
-    def _try(self, action) -> None:
+    def _try(self, action: Callable[[TextIO], object]) -> None:
         if self._stream is None or self.error is not None:
             return
         try:
-            action()
+            action(self._stream)
         except (OSError, ValueError) as error:  # ValueError: it was closed
             self.error = error
             # What is left in its buffer, and what compiled code prints, has to go somewhere.

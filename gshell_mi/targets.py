@@ -33,7 +33,7 @@ class Target:
     depth: np.ndarray | None = None
     known: np.ndarray | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.known is None:
             object.__setattr__(self, "known", np.ones(self.rgba.shape[:2], np.float32))
 

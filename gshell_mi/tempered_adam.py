@@ -5,6 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .arrays import AnyArray
+
 
 class TemperedAdam(mi.ad.Adam):
     """Adam that divides by ``(v * max(v))^(1/4)`` with the second moment ``v``: the geometric mean of what
@@ -15,7 +17,8 @@ class TemperedAdam(mi.ad.Adam):
     places where it shows most.
     """
 
-    def _step(self, cache, value, grad, lr, extra):
+    def _step(self, cache: object, value: mi.Float, grad: mi.Float, lr: float,
+              extra: tuple[AnyArray, ...]) -> tuple[mi.Float, tuple[AnyArray, ...]]:
         stepped, extra = super()._step(cache, value, grad, lr, extra)
         second = extra[2]
         share = second / dr.maximum(dr.max(second), 1e-30)

@@ -39,7 +39,7 @@ class Stopwatch:
         _running = self
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         global _running
         _running = None
 
@@ -54,7 +54,7 @@ def phase(name: str) -> Iterator[Callable]:
     if watch is None:
         yield _ignore
         return
-    results: list = []
+    results: list[object] = []
     dr.eval()
     dr.sync_thread()
     begin, before = watch.clock(), sum(watch.seconds.values())
@@ -65,5 +65,5 @@ def phase(name: str) -> Iterator[Callable]:
     watch.seconds[name] += watch.clock() - begin - inner
 
 
-def _ignore(*_) -> None:
+def _ignore(*_: object) -> None:
     pass

@@ -64,6 +64,7 @@ def _import(given: _Arguments) -> tuple[str, ...]:
         def show(what: str, done: int, count: int) -> None:
             bar.update(task, description=what, completed=done, total=count)
 
+        assert given.output is not None
         result = import_capture(given.source, given.output, config=given.config, overwrite=given.overwrite,
                                 progress=lambda done, count: show("targets", done, count), steps=show)
     _warn(result.warnings)

@@ -12,6 +12,7 @@ from PIL import Image
 from ..errors import UserError
 from ..files import replacing
 from . import video
+from .camera import Camera
 from .config import CaptureConfig
 from .decoding import FLOAT_SUFFIXES
 from .formats import FORMATS, colmap, read_capture
@@ -126,7 +127,7 @@ def make_masks(acquired: Acquired, config: CaptureConfig, to_scene: Callable[[Ca
     acquired.made.append("masks")
 
 
-def _view(path: Path, camera: object) -> View:
+def _view(path: Path, camera: Camera) -> View:
     image = small_copy(path, SIZE)
     return View(np.array(image), camera.resized(*image.size))
 

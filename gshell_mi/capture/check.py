@@ -157,12 +157,14 @@ class _Sheet:
         size = (max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
         brightest = max(np.quantile(rgba[..., :3], 0.995), 1e-6)
         exposed = rgba[..., :3] / max(brightest, 1.0) + (1 - rgba[..., 3:]) * 0.15
-        known = self.scene.targets[index].known[..., None]
+        known = self.scene.targets[index].known
+        assert known is not None, "targets fill it in"
+        known = known[..., None]
         exposed = known * exposed + (1 - known) * (0.4 * exposed + 0.6 * np.array(_UNKNOWN))
         image = Image.fromarray((srgb(exposed) * 255).astype(np.uint8)).resize(size, Image.Resampling.BOX)
         camera = camera.resized(*size)
         if self.hull is not None:
-            image = _with_outline(image, self._hull_mask(camera), _HULL)
+            image = _with_outline(image, _normals(self.hull, camera)[1], _HULL)
         pen = ImageDraw.Draw(image)
         for a, b in _EDGES:
             _line(pen, camera, self.corners[a], self.corners[b], _BOX)
@@ -171,9 +173,6 @@ class _Sheet:
         tile = Image.new("RGB", (_THUMB, _THUMB), (225, 225, 225))
         tile.paste(image, ((_THUMB - size[0]) // 2, (_THUMB - size[1]) // 2))
         return tile
-
-    def _hull_mask(self, camera: Camera) -> np.ndarray:
-        return _normals(self.hull, camera)[1]
 
     # --- all cameras
 
@@ -282,7 +281,7 @@ def _line(pen: ImageDraw.ImageDraw, camera: Camera, start: np.ndarray, end: np.n
         pen.line([tuple(point) for point in ends], fill=color, width=width)
 
 
-def _wrapped(text: str, width: int, font: ImageFont.FreeTypeFont) -> list[str]:
+def _wrapped(text: str, width: int, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[str]:
     lines = [""]
     for word in text.split():
         longer = f"{lines[-1]} {word}".strip()

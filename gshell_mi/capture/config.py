@@ -66,7 +66,7 @@ class CaptureConfig:
     light: Path | None = None
     """Environment map to start from, latitude-longitude, y up in the scene; default: an even light."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.box is not None:
             if not all(map(math.isfinite, self.box)):
                 raise UserError("--box holds NaN or infinity; give six numbers.")

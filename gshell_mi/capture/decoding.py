@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import io
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -133,7 +134,7 @@ class ColorDecoding:
     color_space: str = "sRGB"
     transfer: str | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         colour = colour_science()
         _known(self.color_space, colour.RGB_COLOURSPACES, "--color-space", "colour space")
         if self.transfer not in (None, "linear"):
@@ -168,7 +169,7 @@ class ColorDecoding:
         return None if np.allclose(matrix, np.eye(3), atol=1e-3) else matrix.T.astype(np.float32)
 
 
-def _known(name: str, names: object, option: str, what: str) -> None:
+def _known(name: str, names: Collection[str], option: str, what: str) -> None:
     if name not in names:
         near = difflib.get_close_matches(name, list(names), n=1, cutoff=0.3) or sorted(names)[:1]
         raise UserError(f"{option} '{name}' is no {what} that colour-science knows; the nearest that it "

@@ -90,6 +90,7 @@ def read_ignored(frame: Frame, shape: tuple[int, int], reduction: int) -> np.nda
     Raises:
         UserError: it cannot be read, or has another aspect than its image.
     """
+    assert frame.ignored is not None, "the frame has an ignore mask"
     stored = read_pixels(frame.ignored)
     scale = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1
     values = stored[..., :3].mean(axis=-1, dtype=np.float32) / np.float32(scale)

@@ -45,13 +45,13 @@ class Background:
         (0.0, 1.0, 0.0)
         """
         try:
-            color = ImageColor.getrgb(text)[:3]
+            red, green, blue = ImageColor.getrgb(text)[:3]
         except ValueError:
             raise UserError(f"--background '{text}' is no colour; give one as white, black or "
                             f"'#00ff00'.") from None
         if not tolerance > 0:
             raise UserError(f"--background-tolerance must be positive, and is {tolerance:g}.")
-        return cls(tuple(value / 255 for value in color), tolerance)
+        return cls((red / 255, green / 255, blue / 255), tolerance)
 
     def coverage(self, encoded: np.ndarray) -> np.ndarray:
         """(h, w) from (h, w, 3) encoded values in [0, 1]."""
@@ -78,7 +78,8 @@ def assign_masks(capture: Capture, folder: Path | None) -> Capture:
             if missing:
                 raise UserError(f"The capture names masks, but none for '{missing.image}'; add it, or give "
                                 f"a folder of masks with --masks.")
-            lost = next((frame.mask for frame in capture.frames if not frame.mask.is_file()), None)
+            lost = next((frame.mask for frame in capture.frames
+                         if frame.mask and not frame.mask.is_file()), None)
             if lost:
                 raise UserError(f"Mask '{lost}' is missing, with or without a suffix such as .png; put it "
                                 f"there, or give a folder of masks with --masks.")

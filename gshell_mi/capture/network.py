@@ -24,7 +24,7 @@ def object_probability(image: np.ndarray) -> np.ndarray:
 @cache
 def _session() -> tuple:
     try:
-        import rembg
+        import rembg  # pyright: ignore[reportMissingImports]  # an extra
     except (ImportError, SystemExit):    # it ends the process where it finds no onnxruntime
         raise UserError("--make-masks rembg needs the package: install it with `pip install "
                         "'gshell_mi[rembg]'`, or choose grabcut.") from None

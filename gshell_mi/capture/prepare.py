@@ -135,10 +135,11 @@ def exposure_gains(capture: Capture, file: Path | None, *, exif: bool = True) ->
         stops = [exif_exposure(image) for image in images]
     else:
         return {}
-    if any(value is None for value in stops) or np.ptp(stops) < 1e-3:
+    known = [value for value in stops if value is not None]
+    if len(known) < len(stops) or np.ptp(known) < 1e-3:
         return {}
-    mean = float(np.mean(stops))
-    return {image: 2.0 ** (mean - value) for image, value in zip(images, stops, strict=True)}
+    mean = float(np.mean(known))
+    return {image: 2.0 ** (mean - value) for image, value in zip(images, known, strict=True)}
 
 
 def _stops_from_file(file: Path, images: list[Path]) -> list[float]:

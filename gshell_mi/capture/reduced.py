@@ -75,7 +75,7 @@ def read_reduced_grey(path: Path, size: tuple[int, int], reduction: int) -> np.n
         with Image.open(path) as image:
             if reduction == 1 or image.size != size or image.mode not in ("1", "L"):
                 return None
-            box = (0, 0, *(side // reduction * reduction for side in size))
+            box = (0, 0, size[0] // reduction * reduction, size[1] // reduction * reduction)
             return np.array(image.convert("L").reduce(reduction, box), np.float32) / 255
     except (OSError, SyntaxError, ValueError):
         return None    # reading it in full tells what is wrong
@@ -115,4 +115,4 @@ def match_size(mask: np.ndarray, size: tuple[int, int], shape: tuple[int, int],
     padded = np.pad(mask, ((0, reach[1]), (0, reach[0])), mode="edge")
     filter = Image.Resampling.BOX if scale.min() >= 1 else Image.Resampling.BILINEAR
     box = (0.0, 0.0, min(scale[0] * shape[1], padded.shape[1]), min(scale[1] * shape[0], padded.shape[0]))
-    return np.clip(np.array(Image.fromarray(padded).resize(shape[::-1], filter, box)), 0.0, 1.0)
+    return np.clip(np.array(Image.fromarray(padded).resize((shape[1], shape[0]), filter, box)), 0.0, 1.0)

@@ -87,7 +87,7 @@ def framed(camera: Camera) -> np.ndarray:
         if straight:
             return np.ones((camera.height, camera.width), bool)
     seen = _seen(camera, replace(camera, fy=camera.fx, distortion=Distortion()))
-    return ((seen >= 0) & (seen <= [camera.width, camera.height])).all(axis=-1)
+    return np.asarray(((seen >= 0) & (seen <= [camera.width, camera.height])).all(axis=-1))
 
 
 def _seen(camera: Camera, straight: Camera) -> np.ndarray:

@@ -135,8 +135,8 @@ class _Import:
         files = {file for frame in self.capture.frames for file in (frame.image, frame.mask, frame.ignored)
                  if file}
         files |= {Path(file) for file in (self.config.light, self.config.background) if file is not None}
-        if self.capture.format == mitsuba.NAME:
-            files |= scene_inputs(mitsuba.find(self.capture.source))
+        if self.capture.format == mitsuba.NAME and (scene := mitsuba.find(self.capture.source)):
+            files |= scene_inputs(scene)
         return files
 
     def write(self, partial: Path) -> CaptureResult:

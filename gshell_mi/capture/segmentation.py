@@ -7,6 +7,7 @@ the object is its visual hull; its image in each view says what is certain there
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -90,7 +91,7 @@ def cut_out(views: list[View], subject: Subject, progress: Progress | None = Non
     done = 0
 
     def cut(reduction: int, grid: _Voxels, hull: np.ndarray | None,
-            masks: list[np.ndarray | None]) -> tuple[list[View], list[np.ndarray]]:
+            masks: Sequence[np.ndarray | None]) -> tuple[list[View], list[np.ndarray]]:
         nonlocal done
         reduced, cuts = [view.reduced(reduction) for view in views], []
         for mask in in_order(partial(_cut, subject, grid, hull), list(zip(reduced, masks, strict=True))):
@@ -271,7 +272,8 @@ def _grab_cut(image: np.ndarray, trimap: np.ndarray) -> np.ndarray:
                                                                       columns[-1] + margin))
     marked = trimap[window].copy()
     cv2.setRNGSeed(0)
-    cv2.grabCut(np.ascontiguousarray(image[window]), marked, None, np.zeros((1, 65)), np.zeros((1, 65)), 4,
+    nowhere = (0, 0, 0, 0)  # the mask says where to begin
+    cv2.grabCut(np.ascontiguousarray(image[window]), marked, nowhere, np.zeros((1, 65)), np.zeros((1, 65)), 4,
                 cv2.GC_INIT_WITH_MASK)
     result = np.zeros(trimap.shape, bool)
     result[window] = np.isin(marked, (cv2.GC_FGD, cv2.GC_PR_FGD))

@@ -66,8 +66,7 @@ def find_subject(cameras: list[Camera], points: np.ndarray) -> Subject | None:
     if len(near) < _FEW:
         return Subject(box, near[:0], core=core)
     floor = _floor(near, cameras, radius)
-    height = near @ floor[:3] + floor[3] if floor is not None else None
-    on_object = near if floor is None else near[height > 2 * _FLAT * radius]
+    on_object = near if floor is None else near[near @ floor[:3] + floor[3] > 2 * _FLAT * radius]
     if len(on_object) < _FEW:
         return Subject(box, on_object[:0], floor, core)
     on_object = _clusters(on_object)

@@ -15,7 +15,7 @@ SUFFIXES = (".tif", ".tiff")
 def tiff_size(path: Path) -> tuple[int, int]:
     """(width, height) of the first picture in a TIFF file."""
     with tifffile.TiffFile(path) as file:
-        size = int(file.pages[0].imagewidth), int(file.pages[0].imagelength)
+        size = int(file.pages.first.imagewidth), int(file.pages.first.imagelength)
     if min(size) < 1 or size[0] * size[1] > MOST_PIXELS:
         raise ValueError(f"its header promises {size[0]} x {size[1]} pixels")
     return size
@@ -28,16 +28,17 @@ def read_tiff(path: Path) -> np.ndarray:
     has 16, as dark edges would lose theirs.
     """
     with tifffile.TiffFile(path) as file:
-        page = file.pages[0]
+        page = file.pages.first
         pixels = page.asarray()
         if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and pixels.ndim == 3:
             pixels = np.moveaxis(pixels, 0, -1)
         if page.photometric == tifffile.PHOTOMETRIC.PALETTE:
-            pixels = np.moveaxis(page.colormap, 0, -1)[pixels]
+            pixels = np.moveaxis(np.asarray(page.colormap), 0, -1)[pixels]
         elif page.photometric == tifffile.PHOTOMETRIC.MINISWHITE and pixels.dtype.kind == "u":
             pixels = np.iinfo(pixels.dtype).max - pixels
         elif page.photometric not in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB):
-            raise ValueError(f"its colours are stored as {page.photometric.name}")
+            kind = getattr(page.photometric, "name", page.photometric)  # a number, if no kind has it
+            raise ValueError(f"its colours are stored as {kind}")
         associated = tifffile.EXTRASAMPLE.ASSOCALPHA in page.extrasamples
     return _unassociated(pixels) if associated and pixels.ndim == 3 else pixels
 

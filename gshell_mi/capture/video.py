@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
@@ -74,7 +75,7 @@ def choose(sharpness: np.ndarray, change: np.ndarray, count: int) -> np.ndarray:
                      for members in (np.flatnonzero(stretch == k) for k in range(count)) if len(members)])
 
 
-def _frames(video: Path, pixels: str, options: list[str]) -> Iterator:
+def _frames(video: Path, pixels: str, options: list[str]) -> Generator[Any, None, None]:
     """The properties of a video, then its frames as bytes; ``-fps_mode passthrough`` among the options gives
     each stored frame once, whatever its time.
 

@@ -6,6 +6,7 @@ import drjit as dr
 import numpy as np
 import trimesh
 
+from ..arrays import Array3f, Float, UInt64
 from ..lattice import CubicGrid, Lattice
 from ..topology import curve_ids
 from ..triangles import unit
@@ -31,7 +32,8 @@ def nearest_faces(mesh: trimesh.Trimesh, lattice: Lattice, reach: float) -> tupl
     return vertex, (found[vertex] & 0xFFFFFFFF).astype(np.int64)
 
 
-def _find_nearest(best, triangles: np.ndarray, lattice: Lattice, grid: CubicGrid, reach: float) -> None:
+def _find_nearest(best: UInt64, triangles: np.ndarray, lattice: Lattice, grid: CubicGrid,
+                  reach: float) -> None:
     """Lowers ``best``, at the vertices of one grid, to the squared distance and the number of a triangle."""
     import mitsuba as mi
 
@@ -61,10 +63,10 @@ def _find_nearest(best, triangles: np.ndarray, lattice: Lattice, grid: CubicGrid
         start = stop
 
 
-def _squared_distance(p, u, v):
+def _squared_distance(p: Array3f, u: Array3f, v: Array3f) -> Float:
     """Squared distance of ``p`` to the triangle (0, u, v)."""
 
-    def to_segment(q, direction):
+    def to_segment(q: Array3f, direction: Array3f) -> Float:
         t = dr.clip(dr.dot(q, direction) / dr.maximum(dr.squared_norm(direction), 1e-30), 0, 1)
         return dr.squared_norm(q - t * direction)
 

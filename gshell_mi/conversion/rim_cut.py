@@ -41,6 +41,7 @@ def rim_cut(
     """
     lattice = fields.lattice
     template = extract(lattice, mi.Float(fields.sdf))
+    assert isinstance(lattice, Lattice) and template.stencil is not None
     vertices, faces, _ = template.to_numpy()
     edges, _ = mesh_edges(faces)
     rims = cKDTree(rim)
@@ -120,7 +121,7 @@ def _rim_distance(
         low = np.clip(np.floor((vertices - grid.origin) / h).astype(int), 0, grid.stride - 2)
         corners.append(grid.first + (low @ strides)[:, None] + cube)
     candidates = nearest[np.concatenate(corners, axis=1)]
-    known = (candidates >= 0).any(axis=1)
+    known = np.asarray((candidates >= 0).any(axis=1))
     candidates = np.where(candidates >= 0, candidates, candidates.max(axis=1, keepdims=True))
     feet = feet_of(vertices[known].astype(float), candidates[known])
     inner = rims.query(feet.point)[0]
@@ -153,7 +154,7 @@ class _Patches:
     def __init__(self, values: np.ndarray, faces: np.ndarray):
         self.positive = values > 0
         self.of_vertex = equal_patches(self.positive, faces)
-        self.size = np.bincount(self.of_vertex)
+        self.size: np.ndarray = np.bincount(self.of_vertex)
 
     def specks(self, wanted: np.ndarray) -> np.ndarray:
         """Which vertices lie in patches that are too small, or mostly of a sign that they should not have."""

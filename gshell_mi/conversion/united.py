@@ -26,8 +26,8 @@ def visible_part(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
         mesh: closed; wherever it winds at least once around a point, that is inside.
         cell: of the lattice that this is for; the cut is accurate to a fraction of it.
     """
-    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _COARSEST_CELLS * cell,
-                                                       max_iter=20)
+    divided = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, _COARSEST_CELLS * cell, max_iter=20)
+    vertices, faces = divided[:2]
     pieces = []
     triangles = vertices[faces]
     while len(triangles):

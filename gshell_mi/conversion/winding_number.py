@@ -15,7 +15,7 @@ def winding_number(grid: CubicGrid, mesh: trimesh.Trimesh) -> np.ndarray:
     """
     n, h = grid.stride, grid.spacing
     count = int(np.clip(6 * mesh.area / h**2, 20_000, 1_000_000))
-    samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+    samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
     area_normals = mesh.face_normals[faces] * mesh.area / count
     cell = (samples - grid.origin) / h
     low = np.clip(np.floor(cell).astype(int), 0, n - 2)
@@ -27,7 +27,9 @@ def winding_number(grid: CubicGrid, mesh: trimesh.Trimesh) -> np.ndarray:
         for axis in range(3):
             density[:, axis] += np.bincount(index, weight * area_normals[:, axis], n**3)
     density = density.reshape(n, n, n, 3) / h**3  # indexed [z, y, x]
-    divergence = sum(np.gradient(density[..., axis], h, axis=2 - axis) for axis in range(3))
+    divergence = np.zeros((n, n, n))
+    for axis in range(3):
+        divergence += np.gradient(density[..., axis], h, axis=2 - axis)
     if n < 3:
         return np.zeros(n**3)
     inner = slice(1, -1)

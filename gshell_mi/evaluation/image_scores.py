@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from skimage.metrics import structural_similarity
@@ -71,10 +72,11 @@ def image_scores(image: np.ndarray, reference: np.ndarray) -> tuple[dict[str, fl
                                                 applyMagma=True)
     shown = (image[..., 3] > 0.5, reference[..., 3] > 0.5)
     union, both = shown[0] | shown[1], shown[0] & shown[1]
+    similarity: Any = structural_similarity(left, right, channel_axis=2, data_range=1.0)  # one number so
     squared = (image[..., :3] - reference[..., :3]) ** 2
     return {
         "psnr": psnr(left, right),
-        "ssim": float(structural_similarity(left, right, channel_axis=2, data_range=1.0)),
+        "ssim": float(similarity),
         "flip": float(flip),
         "relative_mse": float((squared / (reference[..., :3] ** 2 + _RELATIVE_FLOOR)).mean()),
         "delta_e": float(_delta_e(left[union], right[union]).mean())

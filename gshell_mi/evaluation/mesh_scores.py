@@ -48,9 +48,9 @@ def mesh_scores(mesh: trimesh.Trimesh, reference: trimesh.Trimesh, samples: int 
     tells orientation and missing parts.
     """
     diagonal = float(np.linalg.norm(reference.extents))
-    (a, face_a), (b, face_b) = (trimesh.sample.sample_surface(m, samples, seed=seed + i)
+    (a, face_a), (b, face_b) = (trimesh.sample.sample_surface(m, samples, seed=seed + i)[:2]
                                 for i, m in enumerate((mesh, reference)))
-    c, _ = trimesh.sample.sample_surface(reference, samples, seed=seed + 2)
+    c = trimesh.sample.sample_surface(reference, samples, seed=seed + 2)[0]
     tree_a, tree_b = cKDTree(a), cKDTree(b)
     (accuracy, _), (completeness, nearest), (floor, _) = tree_b.query(a), tree_a.query(b), tree_b.query(c)
     precision, recall = ((d < F_SCORE_DISTANCE * diagonal).mean() for d in (accuracy, completeness))

@@ -46,7 +46,7 @@ class AssetConfig:
     """No triangle of remeshed.ply is worse than this: 4 sqrt(3) area / sum of squared edge lengths, which is
     1 if equilateral."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.texture_size < 16:
             raise UserError(f"--texture-size must be at least 16 pixels, not {self.texture_size}.")
         if self.face_count < 0:
@@ -140,6 +140,7 @@ def _simplified(fine: FittedMesh, face_count: int) -> tuple[np.ndarray, np.ndarr
 
 
 def _write_remeshed(folder: Path, fine: FittedMesh, config: AssetConfig) -> dict:
+    assert config.remesh is not None
     vertices, faces = remesh(fine.vertices, fine.faces, config.remesh, resample_boundary=True,
                              min_quality=config.min_quality)
     normals = vertex_normals(vertices, faces)

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -88,8 +88,9 @@ def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.nd
     normals = np.array(surface.vertex_normals().numpy()).T.reshape(-1, 3)
     vertices = without_slivers(vertices, faces, normals)
     if detail and len(faces):
-        vertices, faces, values = trimesh.remesh.subdivide(vertices, faces, vertex_attributes={
+        divided: Any = trimesh.remesh.subdivide(vertices, faces, vertex_attributes={
             "normal": normals} | attributes)
+        vertices, faces, values = divided  # two of them without attributes
         normals, attributes = unit(values.pop("normal")), values
         color = mi.Color3f(np.ascontiguousarray(attributes["vertex_color"].T, np.float32))
         point = mi.Point3f(np.ascontiguousarray(vertices.T, np.float32))

@@ -60,7 +60,7 @@ class FitFolder:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def check(self, inputs: Iterable[Path], views: Iterable[str]) -> None:

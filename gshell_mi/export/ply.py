@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -63,7 +64,7 @@ def read_ply(path: Path) -> FittedMesh:
         return FittedMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3)), {})
     attributes = {}
     try:
-        mesh = trimesh.load(path, process=False, force="mesh")
+        mesh: Any = trimesh.load(path, process=False, force="mesh")
         table = mesh.metadata["_ply_raw"]["vertex"]["data"]
         columns = {name: np.ravel(table[name]) for name in table.dtype.names}
         stacked = {axes: np.stack([columns.pop(name) for name in names], axis=1) for axes, names in

@@ -8,6 +8,7 @@ from xml.sax.saxutils import quoteattr
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..compat import environment_radiance, write_bitmap
 from ..errors import UserError
@@ -136,5 +137,5 @@ def _sensor(sensor: mi.Sensor) -> str:
                           crop_x=crop_x, crop_y=crop_y)
 
 
-def _matrix(matrix) -> str:
+def _matrix(matrix: ArrayLike) -> str:
     return " ".join(f"{x:.9g}" for x in np.array(matrix, dtype=np.float64).reshape(4, 4).ravel())

@@ -7,12 +7,12 @@ and others do not.
 """
 
 from functools import cache
-from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from ..lattice import MISSING
+from ..arrays import UInt32
+from ..lattice import MISSING, BccLattice
 from ..lattice.sign_words import is_set
 from . import tet_tables as tables
 from .grid_extraction import ActiveCells
@@ -22,10 +22,10 @@ from .tetrahedra import TetExtraction
 class BccExtraction(TetExtraction):
     """Marching tetrahedra between two cubic grids."""
 
-    def corner(self, vertex: Any, corner: Any) -> Any:
+    def corner(self, vertex: UInt32, corner: UInt32) -> UInt32:
         return self.lattice.corner(vertex, corner)
 
-    def classify(self, inside: Any, cell: Any) -> ActiveCells:
+    def classify(self, inside: UInt32, cell: UInt32) -> ActiveCells:
         # A corner that does not exist takes the sign of the cell's own vertex: no edge there is crossed.
         own = is_set(inside, cell)
         signs = dr.select(own, self.uint_t(1), 0)
@@ -40,9 +40,10 @@ class BccExtraction(TetExtraction):
         dr.eval(signs, crossed, lacking)
         return ActiveCells(inside, cell, signs, crossed, lacking)
 
-    def _lone(self, cell: Any) -> Any:
+    def _lone(self, cell: UInt32) -> UInt32:
         """Bit d: the edge to corner d belongs to no tetrahedron. So it is with the outermost rows of each
         grid on the side where the other grid does not reach beyond it, and with two half diagonals."""
+        assert isinstance(self.lattice, BccLattice), "its fields do not fit in blocks"
         x, y, z = self.lattice.coordinates(cell)
         second, last = cell >= self.stride * self.stride * self.stride, self.stride - 1
         end = dr.select(second, last, 0)
@@ -50,9 +51,12 @@ class BccExtraction(TetExtraction):
         along_z, along_y, along_x = at_x & at_y, at_x & at_z, at_y & at_z
         in_corner = ~second & ((x + y + z == 0) | (x + y + z == 3 * last))
         bits = ((along_z, 0b011), (along_y, 0b101), (along_x, 0b110), (in_corner, 0b111))
-        return sum(dr.select(lone, self.uint_t(1 << corner), 0) for lone, corner in bits)
+        lone = self.uint_t(0)
+        for outermost, corner in bits:
+            lone |= dr.select(outermost, self.uint_t(1 << corner), 0)
+        return lone
 
-    def active_tets(self, cells: ActiveCells) -> Any:
+    def active_tets(self, cells: ActiveCells) -> UInt32:
         existing = dr.gather(self.uint_t, self.uint_t(existing_tets_table()), cells.border)
         return existing & dr.gather(self.uint_t, self.uint_t(tables.active_tets_table()), cells.signs)
 

@@ -8,10 +8,10 @@ lower number and by which of the four faces around that vertex's edge holds it.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 
+from ..arrays import Array3u, Bool, UInt32
 from ..lattice.sign_words import expand
 from . import cube_tables as tables
 from .grid_extraction import ActiveCells, MarchingExtraction
@@ -22,42 +22,42 @@ from .surface_mesh import concatenate
 class _Polygons:
     """Isosurface polygons; up to four per active cube."""
 
-    key: Any  # entry in the tables
-    size: Any  # vertices, 3 to 7
-    corners: Any  # their mesh vertices, eight slots per polygon
+    key: UInt32  # entry in the tables
+    size: UInt32  # vertices, 3 to 7
+    corners: UInt32  # their mesh vertices, eight slots per polygon
 
-    def at(self, index: Any) -> "_Polygons":
+    def at(self, index: UInt32) -> "_Polygons":
         uint_t = type(index)
         slot = dr.arange(uint_t, 8 * dr.width(index))
         source = dr.gather(uint_t, index, slot >> 3) << 3 | slot & 7
         key, size = (dr.gather(uint_t, x, index) for x in (self.key, self.size))
         return _Polygons(key, size, dr.gather(uint_t, self.corners, source))
 
-    def renumbered(self, order: Any) -> "_Polygons":
+    def renumbered(self, order: UInt32) -> "_Polygons":
         corners = dr.gather(type(order), order, self.corners)
         dr.eval(corners)
         return replace(self, corners=corners)
 
-    def slots(self) -> tuple[Any, Any]:
+    def slots(self) -> tuple[UInt32, Bool]:
         """Per slot of ``corners``: its polygon and whether it holds a vertex."""
         uint_t = type(self.key)
         slot = dr.arange(uint_t, dr.width(self.corners))
         polygon = slot >> 3
         return polygon, slot & 7 < dr.gather(uint_t, self.size, polygon)
 
-    def mask(self, condition: Any) -> Any:
+    def mask(self, condition: Bool) -> UInt32:
         """Per polygon: bit i tells whether the condition holds in slot i."""
         uint_t = type(self.key)
         bit = dr.arange(uint_t, dr.width(self.corners)) & 7
         return dr.block_reduce(dr.ReduceOp.Or, dr.select(condition, uint_t(1) << bit, 0), 8)
 
 
-class CubeExtraction(MarchingExtraction):
+class CubeExtraction(MarchingExtraction[_Polygons]):
     """Marching cubes."""
 
     EDGE_DIFFERENCES = 0b00010110
 
-    def polygons(self, cells: ActiveCells, record: Any) -> _Polygons:
+    def polygons(self, cells: ActiveCells, record: UInt32) -> _Polygons:
         masks = self.uint_t(tables.polygon_mask_table())
         mask = dr.gather(self.uint_t, masks, cells.signs, cells.border == 0)
         owner, number = expand(mask, 2)
@@ -74,16 +74,16 @@ class CubeExtraction(MarchingExtraction):
         exists = edge != 0
         corners = self.edge_vertex(record, dr.gather(self.uint_t, base, polygon), edge, exists)
         corners = dr.select(exists, corners, 0)
-        size = dr.popcnt(_Polygons(key, None, corners).mask(exists))
+        size = dr.popcnt(_Polygons(key, key, corners).mask(exists))
         dr.eval(corners, size)
         return _Polygons(key, size, corners)
 
-    def triangulate(self, polygons: _Polygons) -> Any:
+    def triangulate(self, polygons: _Polygons) -> Array3u:
         if dr.width(polygons.key) == 0:
             return dr.zeros(self.faces_t, 0)
         return self.triangles(polygons, (self.uint_t(1) << polygons.size) - 1, polygons.corners, 3)
 
-    def triangles(self, polygons: _Polygons, kept: Any, local: Any, log2_slots: int) -> Any:
+    def triangles(self, polygons: _Polygons, kept: UInt32, local: UInt32, log2_slots: int) -> Array3u:
         """The triangles of what is kept of polygons.
 
         Args:
@@ -104,7 +104,8 @@ class CubeExtraction(MarchingExtraction):
         dr.eval(faces)
         return faces
 
-    def clip(self, polygons: _Polygons, record: Any, count: int, kept_count: int) -> tuple[Any, Any, Any]:
+    def clip(self, polygons: _Polygons, record: UInt32, count: int,
+             kept_count: int) -> tuple[Array3u, UInt32, UInt32]:
         none = dr.zeros(self.uint_t, 0)
         if dr.width(polygons.key) == 0:
             return dr.zeros(self.faces_t, 0), none, none

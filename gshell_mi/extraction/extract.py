@@ -1,9 +1,9 @@
 """The entrance to extraction: checks the fields and hands them to the lattice's algorithm."""
 
-from typing import Any
 
 import drjit as dr
 
+from ..arrays import Field, Float
 from ..errors import UserError
 from ..lattice import BccLattice, BlockLattice, CubeLattice, FlexiCubesLattice, Lattice, TetLattice
 from .bcc import BccExtraction
@@ -23,11 +23,11 @@ _ALGORITHMS: dict[str, type[GridExtraction]] = {
 
 def extract(
     lattice: Lattice | BlockLattice,
-    sdf: Any,
-    msdf: Any = None,
-    deform: Any = None,
+    sdf: Float,
+    msdf: Float | None = None,
+    deform: Field | None = None,
     *,
-    weights: Any = None,
+    weights: Float | None = None,
     template: bool = False,
 ) -> SurfaceMesh:
     """The surface ``{sdf = 0, msdf >= 0}`` as a triangle mesh, differentiable in all three fields.
@@ -71,14 +71,14 @@ def extract(
                 f"weights belong to the grid 'flexicubes', not to '{lattice.grid}'; leave them out"
             )
         sizes["weights"], fields["weights"] = lattice.weight_count, weights
-    fields = {name: _flat(name, field, sizes[name]) for name, field in fields.items() if field is not None}
-    _check_finite(fields)
-    algorithm = _ALGORITHMS[lattice.grid](lattice, type(fields["sdf"]))
-    arguments = (fields.get(name) for name in ("sdf", "msdf", "deform"))
-    return algorithm.run(*arguments, template, fields.get("weights"))
+    checked = {name: _flat(name, field, sizes[name]) for name, field in fields.items() if field is not None}
+    _check_finite(checked)
+    algorithm = _ALGORITHMS[lattice.grid](lattice, type(checked["sdf"]))
+    return algorithm.run(checked["sdf"], checked.get("msdf"), checked.get("deform"), template,
+                         checked.get("weights"))
 
 
-def _flat(name: str, field: Any, count: int) -> Any:
+def _flat(name: str, field: Field, count: int) -> Field:
     """The field as a flat array (``Array3f`` stays), checked for its size."""
     if dr.is_tensor_v(field):
         field = field.array
@@ -88,13 +88,13 @@ def _flat(name: str, field: Any, count: int) -> Any:
     return field
 
 
-def _check_finite(fields: dict[str, Any]) -> None:
+def _check_finite(fields: dict[str, Field]) -> None:
     for name, field in fields.items():
         if not _is_finite(field):
             raise UserError(f"{name} holds NaN or infinite values")
 
 
-def _is_finite(*fields: Any) -> bool:
+def _is_finite(*fields: Field) -> bool:
     for field in fields:
         for part in list(dr.detach(field)) if dr.depth_v(field) == 2 else [dr.detach(field)]:
             # A sum reads the field once and is not finite if any value is not; should it have overflowed,

@@ -13,10 +13,10 @@ the lattice and every diagonal belongs to an edge of it, so both triangles at a 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 
+from ..arrays import Array3f, Array3u, Bool, Field, Float, UInt32
 from ..lattice import BlockLattice, FlexiCubesLattice, Lattice
 from ..lattice.lattice import corner_offset
 from ..lattice.sign_words import expand, is_set
@@ -39,12 +39,12 @@ _FLAT = 0.01
 class _Polygons:
     """Isosurface polygons of cubes, with one vertex each."""
 
-    cell: Any  # lowest lattice vertex of the cube
+    cell: UInt32  # lowest lattice vertex of the cube
     points: DualPoints
-    crossing: Any  # the crossed edges that they go through; eight slots per polygon
-    side: Any  # ``side_table``, per slot
-    around: Any  # ``around_table``, per slot
-    exists: Any  # per slot: the polygon has that many vertices
+    crossing: UInt32  # the crossed edges that they go through; eight slots per polygon
+    side: UInt32  # ``side_table``, per slot
+    around: UInt32  # ``around_table``, per slot
+    exists: Bool  # per slot: the polygon has that many vertices
 
 
 class FlexiCubesExtraction(GridExtraction):
@@ -52,12 +52,12 @@ class FlexiCubesExtraction(GridExtraction):
 
     EDGE_DIFFERENCES = 0b00010110
 
-    def __init__(self, lattice: FlexiCubesLattice | BlockLattice, float_t: type):
+    def __init__(self, lattice: FlexiCubesLattice | BlockLattice, float_t: type[Float]):
         super().__init__(lattice, float_t)
         self.margin = dr.opaque(float_t, _MARGIN)
 
-    def surface(self, cells: ActiveCells, sdf: Any, msdf: Any, deform: Any, with_template: bool,
-                weights: Any) -> SurfaceMesh:
+    def surface(self, cells: ActiveCells, sdf: Float, msdf: Float | None, deform: Field | None,
+                with_template: bool, weights: Float | None) -> SurfaceMesh:
         a, _ = self.crossed_edges(cells)
         count = dr.width(a)
         if count == 0:
@@ -72,7 +72,7 @@ class FlexiCubesExtraction(GridExtraction):
         if kept_count == 0 and not with_template:
             return self.empty_mesh(False)
         faces, diagonal = self.quads(cells.inside, a, polygons, weights, deform)
-        if kept_count in (0, points.count):
+        if msdf is None or kept_count in (0, points.count):
             uncut = self.mesh((points,), faces, msdf, deform, kept_count)
             mesh = uncut if kept_count else self.empty_mesh(False)
             return replace(mesh, template=uncut) if with_template else mesh
@@ -95,7 +95,7 @@ class FlexiCubesExtraction(GridExtraction):
 
     # Polygons -----------------------------------------------------------------------------------------
 
-    def cases(self, cells: ActiveCells) -> Any:
+    def cases(self, cells: ActiveCells) -> UInt32:
         """Signs, + 256 where both cubes at an ambiguous face visit it twice."""
         faces = self.uint_t(tables.twice_visited_face_table())
         face = dr.gather(self.uint_t, faces, cells.signs, cells.border == 0)
@@ -114,7 +114,7 @@ class FlexiCubesExtraction(GridExtraction):
         dr.scatter(case, signs + 256, visited, both, dr.ReduceMode.Permute)
         return case
 
-    def polygons(self, cells: ActiveCells, record: Any, weights: Any, sdf: Any) -> _Polygons:
+    def polygons(self, cells: ActiveCells, record: UInt32, weights: Float | None, sdf: Float) -> _Polygons:
         case = self.cases(cells)
         masks = self.uint_t(tables.polygon_mask_table())
         owner, number = expand(dr.gather(self.uint_t, masks, case, cells.border == 0), 2)
@@ -151,7 +151,7 @@ class FlexiCubesExtraction(GridExtraction):
         weight /= gather(self.float_t, total, polygon)
         return _Polygons(cell, DualPoints(EdgePoints(a, b, t), weight), crossing, side, around, exists)
 
-    def value(self, sdf: Any, vertex: Any) -> Any:
+    def value(self, sdf: Float, vertex: UInt32) -> Float:
         """The field, of which vertices on the border see nothing negative."""
         value = gather(self.float_t, sdf, vertex)
         last = self.stride - 1
@@ -160,14 +160,14 @@ class FlexiCubesExtraction(GridExtraction):
             border |= (coordinate == 0) | (coordinate == last)
         return dr.select(border & (value < 0), 0, value)
 
-    def neighbour(self, vertex: Any, axis: Any, up: Any) -> Any:
+    def neighbour(self, vertex: UInt32, axis: UInt32, up: Bool) -> UInt32:
         """The next vertex up or down an axis."""
         if isinstance(self.lattice, BlockLattice):
             return self.lattice.neighbour(vertex, axis, up)
         step = corner_offset(self.uint_t(1) << axis, self.stride)
         return dr.select(up, vertex + step, vertex - step)
 
-    def cube(self, cell: Any) -> Any:
+    def cube(self, cell: UInt32) -> UInt32:
         """Number of the cube above a vertex among those that have weights."""
         if isinstance(self.lattice, BlockLattice):
             return cell
@@ -175,12 +175,13 @@ class FlexiCubesExtraction(GridExtraction):
         side = self.stride - 1
         return x + (y + z * side) * side
 
-    def weight(self, weights: Any, index: Any) -> Any:
+    def weight(self, weights: Float, index: UInt32) -> Float:
         return positive_weight(gather(self.float_t, weights, index))
 
     # Quads --------------------------------------------------------------------------------------------
 
-    def quads(self, inside: Any, a: Any, polygons: _Polygons, weights: Any, deform: Any) -> tuple[Any, Any]:
+    def quads(self, inside: UInt32, a: UInt32, polygons: _Polygons, weights: Float | None,
+              deform: Field | None) -> tuple[Array3u, Bool]:
         """Two triangles per crossed edge, and whether its quad is split from the first corner on."""
         count = dr.width(a)
         slot = dr.arange(self.uint_t, dr.width(polygons.crossing))
@@ -218,21 +219,22 @@ class FlexiCubesExtraction(GridExtraction):
         dr.eval(faces)
         return faces, first
 
-    def turn(self, inside: Any, a: Any) -> list:
+    def turn(self, inside: UInt32, a: UInt32) -> list[UInt32]:
         """The numbers of the cubes around edges, anticlockwise seen from outside."""
         upwards = is_set(inside, a)
         return [self.uint_t(0), dr.select(upwards, self.uint_t(1), 2), self.uint_t(3),
                 dr.select(upwards, self.uint_t(2), 1)]
 
     @staticmethod
-    def least_area(p: list) -> Any:
+    def least_area(p: list[Array3f]) -> Float:
         """The smaller area of the triangles (0, 1, 2) and (2, 3, 0), squared."""
         return dr.minimum(
             dr.squared_norm(dr.cross(p[1] - p[0], p[2] - p[0])),
             dr.squared_norm(dr.cross(p[3] - p[2], p[0] - p[2])),
         )
 
-    def edge_names(self, count: int, polygons: _Polygons, inside: Any, a: Any, diagonal: Any) -> Any:
+    def edge_names(self, count: int, polygons: _Polygons, inside: UInt32, a: UInt32,
+                   diagonal: Bool) -> Array3u:
         """Names of the triangles' edges: four times a crossing plus a face around it, or a diagonal's."""
         slot = dr.arange(self.uint_t, dr.width(polygons.crossing))
         following = dr.gather(self.uint_t, polygons.crossing, (slot & ~self.uint_t(7)) | polygons.side >> 4)
@@ -261,12 +263,12 @@ class FlexiCubesExtraction(GridExtraction):
         return result
 
 
-def positive_weight(weight: Any) -> Any:
+def positive_weight(weight: Float) -> Float:
     """From weights without bounds, 0 being neutral, to those of the formulas, between 0.1 and 1.9."""
     return dr.fma(dr.tanh(weight), 0.9, 1)
 
 
-def deviation(mesh: SurfaceMesh, lattice: Lattice, deform: Any = None) -> Any:
+def deviation(mesh: SurfaceMesh, lattice: Lattice, deform: Field | None = None) -> Float:
     """The FlexiCubes regulariser (Shen et al. 2023, eq. 8), one value per vertex that is not on a cut.
 
     The mean absolute deviation of the distances between a vertex and the crossings that it is the mean of:

@@ -14,16 +14,17 @@ Everything up to here is detached. Derivatives flow through the final formula fo
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar, Generic, Protocol, Self, TypeVar
 
 import drjit as dr
 
+from ..arrays import Array3u, Bool, Field, Float, UInt32
 from ..errors import UserError
 from ..lattice import MISSING, BlockLattice, Lattice, array_type
 from ..lattice.lattice import corner_offset
 from ..lattice.sign_scan import active_cells
 from ..lattice.sign_words import NEGATIVE, expand, is_set
-from .surface_mesh import CutPoints, EdgePoints, Stencil, SurfaceMesh, concatenate, gather
+from .surface_mesh import CutPoints, DualPoints, EdgePoints, Points, Stencil, SurfaceMesh, concatenate, gather
 
 #: Field values smaller than this count as this, so that gradients of slivers stay below 1e7.
 FIELD_FLOOR = 1e-7
@@ -35,15 +36,15 @@ _MAX_VERTICES = 1 << 25  # what fits beside 7 edge bits in the 32 bits of a cell
 class ActiveCells:
     """The cells with crossed edges; those at the upper borders are cells for the edges that they own."""
 
-    inside: Any
+    inside: UInt32
     """The signs of all vertices, 32 to a word."""
-    cell: Any
+    cell: UInt32
     """Ids of their lowest vertices, ascending."""
-    signs: Any
+    signs: UInt32
     """Bit c: corner c is inside."""
-    crossed: Any
+    crossed: UInt32
     """Bit d: the edge from the lowest corner to corner d is crossed."""
-    border: Any
+    border: UInt32
     """Bit i: the cell reaches beyond the lattice along axis i, so that it is no cell. In a body-centred cubic
     lattice, bit c: its corner c does not exist."""
 
@@ -54,7 +55,7 @@ class GridExtraction(ABC):
     EDGE_DIFFERENCES: ClassVar[int]
     """Bit d: the lattice has edges from the lowest corner of a cell to corner d."""
 
-    def __init__(self, lattice: Lattice | BlockLattice, float_t: type):
+    def __init__(self, lattice: Lattice | BlockLattice, float_t: type[Float]):
         self.lattice = lattice
         self.float_t = float_t
         self.uint_t = uint_t = dr.uint32_array_t(float_t)
@@ -66,39 +67,41 @@ class GridExtraction(ABC):
         # spans 16 units in the last place of a coordinate near 1.
         self.margin = dr.opaque(float_t, (16 * 2.0**-24 / lattice.spacing) ** 0.5)
 
-    def run(self, sdf: Any, msdf: Any, deform: Any, with_template: bool, weights: Any) -> SurfaceMesh:
+    def run(self, sdf: Float, msdf: Float | None, deform: Field | None, with_template: bool,
+            weights: Float | None) -> SurfaceMesh:
         """The mesh of flat fields that ``extract`` has checked."""
         cells = self.active_cells(dr.detach(sdf))
         return replace(self.surface(cells, sdf, msdf, deform, with_template, weights), cells=cells.cell)
 
     @abstractmethod
-    def surface(self, cells: ActiveCells, sdf: Any, msdf: Any, deform: Any, with_template: bool,
-                weights: Any) -> SurfaceMesh:
+    def surface(self, cells: ActiveCells, sdf: Float, msdf: Float | None, deform: Field | None,
+                with_template: bool, weights: Float | None) -> SurfaceMesh:
         """The mesh in the active cells."""
 
     # Edges --------------------------------------------------------------------------------------------
 
-    def corner(self, vertex: Any, corner: Any) -> Any:
+    def corner(self, vertex: UInt32, corner: UInt32) -> UInt32:
         """The lattice vertex at a corner of the cell above ``vertex``; arbitrary where there is none."""
         if isinstance(self.lattice, BlockLattice):
             return self.lattice.corner(vertex, corner)
         return vertex + corner_offset(corner, self.stride)
 
-    def coordinates(self, vertex: Any) -> tuple[Any, Any, Any]:
+    def coordinates(self, vertex: UInt32) -> tuple[UInt32, UInt32, UInt32]:
         if isinstance(self.lattice, BlockLattice):
             vertex = self.lattice.lattice_vertex(vertex)
         row = vertex // self.stride
         z = row // self.stride
         return vertex - row * self.stride, row - z * self.stride, z
 
-    def active_cells(self, s: Any) -> ActiveCells:
+    def active_cells(self, s: Float) -> ActiveCells:
         """The cells with crossed edges and few others."""
-        blocks = isinstance(self.lattice, BlockLattice)
-        cell, inside = self.lattice.active_cells(s) if blocks else active_cells(s, self.lattice)
+        lattice = self.lattice
+        blocks = isinstance(lattice, BlockLattice)
+        cell, inside = lattice.active_cells(s) if blocks else active_cells(s, lattice)
         # Operands of size 0 do not go together with others of size 1.
         return self.classify(inside, cell) if dr.width(cell) else ActiveCells(inside, cell, cell, cell, cell)
 
-    def classify(self, inside: Any, cell: Any) -> ActiveCells:
+    def classify(self, inside: UInt32, cell: UInt32) -> ActiveCells:
         border = dr.zeros(self.uint_t)
         for axis, coordinate in enumerate(self.coordinates(cell)):
             border |= dr.select(coordinate == self.stride - 1, self.uint_t(1 << axis), 0)
@@ -114,7 +117,7 @@ class GridExtraction(ABC):
         dr.eval(signs, crossed, border)
         return ActiveCells(inside, cell, signs, crossed, border)
 
-    def crossed_edges(self, cells: ActiveCells) -> tuple[Any, Any]:
+    def crossed_edges(self, cells: ActiveCells) -> tuple[UInt32, UInt32]:
         """The lattice vertices that the crossed edges join, in the order of the mesh vertices on them."""
         owner, difference = expand(cells.crossed, 3)
         count = dr.width(owner)
@@ -130,7 +133,7 @@ class GridExtraction(ABC):
         dr.eval(a, b)
         return a, b
 
-    def record_edges(self, cells: ActiveCells) -> Any:
+    def record_edges(self, cells: ActiveCells) -> UInt32:
         """Array over the lattice: for every active cell, its first mesh vertex and its crossed edges.
 
         Entries of other cells are arbitrary and never read.
@@ -140,7 +143,7 @@ class GridExtraction(ABC):
         dr.scatter(record, first << 7 | cells.crossed >> 1, cells.cell, mode=dr.ReduceMode.Permute)
         return record
 
-    def edge_vertex(self, record: Any, base: Any, edge: Any, active: Any = True) -> Any:
+    def edge_vertex(self, record: UInt32, base: UInt32, edge: UInt32, active: Bool | bool = True) -> UInt32:
         """The mesh vertex on an edge (corner << 3 | difference) of the cell ``base``."""
         entry = dr.gather(self.uint_t, record, self.corner(base, edge >> 3), active)
         below = (self.uint_t(1) << ((edge & 7) - 1)) - 1
@@ -148,7 +151,7 @@ class GridExtraction(ABC):
 
     # Vertices -----------------------------------------------------------------------------------------
 
-    def zero_crossing(self, x0: Any, x1: Any) -> Any:
+    def zero_crossing(self, x0: Float, x1: Float) -> Float:
         """Where a linear function with the values x0 and x1 of opposite sign is 0, off both ends.
 
         Magnitudes that are too small are raised, with the derivative of the identity: a vertex held at
@@ -166,12 +169,12 @@ class GridExtraction(ABC):
         # 2^126 for 0.
         return 0.125 * m0 / (0.125 * m0 + 0.125 * m1)
 
-    def kept_and_dropped(self, points: Any, msdf: Any) -> tuple[Any, Any]:
+    def kept_and_dropped(self, points: EdgePoints | DualPoints, msdf: Float) -> tuple[UInt32, UInt32]:
         """Indices of the points where the mSDF is not negative, and of the others."""
         positive = points.interpolate(dr.detach(msdf)) >= NEGATIVE
         return dr.compress(positive), dr.compress(~positive)
 
-    def kept_first(self, kept: Any, dropped: Any) -> Any:
+    def kept_first(self, kept: UInt32, dropped: UInt32) -> UInt32:
         """New numbers of the vertices, kept ones first, as the open surface and its template share them."""
         kept_count = dr.width(kept)
         order = dr.empty(self.uint_t, kept_count + dr.width(dropped))
@@ -180,11 +183,12 @@ class GridExtraction(ABC):
         dr.scatter(order, rest, dropped, mode=dr.ReduceMode.Permute)
         return order
 
-    def edge_points(self, sdf: Any, a: Any, b: Any) -> EdgePoints:
+    def edge_points(self, sdf: Float, a: UInt32, b: UInt32) -> EdgePoints:
         s_a, s_b = gather(self.float_t, sdf, a), gather(self.float_t, sdf, b)
         return EdgePoints(a, b, self.zero_crossing(s_a, s_b))
 
-    def mesh(self, blocks: tuple, faces: Any, msdf: Any, deform: Any, kept_count: int) -> SurfaceMesh:
+    def mesh(self, blocks: tuple[Points, ...], faces: Array3u, msdf: Float | None, deform: Field | None,
+             kept_count: int) -> SurfaceMesh:
         stencil = Stencil(blocks)
         vertices = stencil.apply(lambda vertex: self.lattice.offset_positions(vertex, deform, self.float_t))
         if msdf is None:
@@ -210,11 +214,22 @@ class GridExtraction(ABC):
         return replace(empty, template=empty) if with_template else empty
 
 
-class MarchingExtraction(GridExtraction):
+class Polygons(Protocol):
+    """Isosurface polygons, as a kind of lattice stores them."""
+
+    def renumbered(self, order: UInt32) -> Self:
+        """The same with other numbers for the mesh vertices: ``order`` has one for each."""
+        ...
+
+
+PolygonsT = TypeVar("PolygonsT", bound=Polygons)
+
+
+class MarchingExtraction(GridExtraction, Generic[PolygonsT]):
     """Extractions whose polygons' vertices lie on the edges of the lattice."""
 
-    def surface(self, cells: ActiveCells, sdf: Any, msdf: Any, deform: Any, with_template: bool,
-                weights: Any) -> SurfaceMesh:
+    def surface(self, cells: ActiveCells, sdf: Float, msdf: Float | None, deform: Field | None,
+                with_template: bool, weights: Float | None) -> SurfaceMesh:
         a, b = self.crossed_edges(cells)
         count = dr.width(a)
         if count == 0:
@@ -228,7 +243,7 @@ class MarchingExtraction(GridExtraction):
             kept_count = dr.width(kept)
         if kept_count == 0 and not with_template:
             return self.empty_mesh(False)
-        if kept_count in (0, count):
+        if msdf is None or kept_count in (0, count):
             points = self.edge_points(sdf, a, b)
             uncut = self.mesh((points,), self.triangulate(polygons), msdf, deform, kept_count)
             mesh = uncut if kept_count else self.empty_mesh(False)
@@ -253,15 +268,16 @@ class MarchingExtraction(GridExtraction):
         return replace(self.mesh(blocks, faces, msdf, deform, kept_count), template=template)
 
     @abstractmethod
-    def polygons(self, cells: ActiveCells, record: Any) -> Any:
-        """The isosurface polygons of all cells; has a method ``renumbered(order)``."""
+    def polygons(self, cells: ActiveCells, record: UInt32) -> PolygonsT:
+        """The isosurface polygons of all cells."""
 
     @abstractmethod
-    def triangulate(self, polygons: Any) -> Any:
+    def triangulate(self, polygons: PolygonsT) -> Array3u:
         """Triangles of whole polygons."""
 
     @abstractmethod
-    def clip(self, polygons: Any, record: Any, count: int, kept_count: int) -> tuple[Any, Any, Any]:
+    def clip(self, polygons: PolygonsT, record: UInt32, count: int,
+             kept_count: int) -> tuple[Array3u, UInt32, UInt32]:
         """Faces of the kept part of all polygons, and the ends of the segments that cut vertices lie on.
 
         Returns:

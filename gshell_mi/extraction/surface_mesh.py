@@ -1,13 +1,14 @@
 """The extracted mesh, and how its vertices hang on the lattice."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
 import numpy as np
 import trimesh
 
+from ..arrays import AnyArray, Array3f, Array3u, ArrayT, Float, UInt32
 from ..errors import UserError
 from ..lattice import array_type
 
@@ -16,26 +17,26 @@ from ..lattice import array_type
 class EdgePoints:
     """Points on lattice edges: the point ``(1 - t) a + t b`` of the edge from vertex ``a`` to ``b``."""
 
-    a: Any  # UInt32, vertex ids
-    b: Any  # UInt32
-    t: Any  # Float in (0, 1), attached to the signed distance field
+    a: UInt32  # vertex ids
+    b: UInt32
+    t: Float  # in (0, 1), attached to the signed distance field
 
     @property
     def count(self) -> int:
         return dr.width(self.a)
 
-    def apply(self, fetch: Callable[[Any], Any]) -> Any:
+    def apply(self, fetch: Callable[[UInt32], ArrayT]) -> ArrayT:
         return _lerp(fetch(self.a), fetch(self.b), self.t)
 
-    def interpolate(self, field: Any) -> Any:
+    def interpolate(self, field: ArrayT) -> ArrayT:
         return self.apply(lambda vertex: gather(type(field), field, vertex))
 
-    def entries(self) -> list[tuple[Any, Any, Any]]:
+    def entries(self) -> list[tuple[UInt32, UInt32, Float]]:
         """The interpolation as a sparse matrix: (point, lattice vertex, weight), entry by entry."""
         point = dr.arange(type(self.a), self.count)
         return [(point, self.a, 1 - self.t), (point, self.b, self.t)]
 
-    def at(self, index: Any) -> "EdgePoints":
+    def at(self, index: UInt32) -> "EdgePoints":
         a, b = (dr.gather(type(index), x, index) for x in (self.a, self.b))
         return EdgePoints(a, b, gather(type(self.t), self.t, index))
 
@@ -46,23 +47,23 @@ class DualPoints:
 
     edges: EdgePoints
     """The points, eight per mean."""
-    weight: Any
+    weight: Float
     """Their weights, which sum to 1 for each mean; 0 in unused slots."""
 
     @property
     def count(self) -> int:
         return dr.width(self.weight) // 8
 
-    def apply(self, fetch: Callable[[Any], Any]) -> Any:
+    def apply(self, fetch: Callable[[UInt32], ArrayT]) -> ArrayT:
         return dr.block_sum(self.weight * self.edges.apply(fetch), 8)
 
-    def interpolate(self, field: Any) -> Any:
+    def interpolate(self, field: ArrayT) -> ArrayT:
         return self.apply(lambda vertex: gather(type(field), field, vertex))
 
-    def entries(self) -> list[tuple[Any, Any, Any]]:
+    def entries(self) -> list[tuple[UInt32, UInt32, Float]]:
         return [(slot >> 3, vertex, self.weight * share) for slot, vertex, share in self.edges.entries()]
 
-    def at(self, index: Any) -> "DualPoints":
+    def at(self, index: UInt32) -> "DualPoints":
         slot = dr.arange(type(index), 8 * dr.width(index))
         source = dr.gather(type(index), index, slot >> 3) << 3 | slot & 7
         return DualPoints(self.edges.at(source), gather(type(self.weight), self.weight, source))
@@ -74,16 +75,16 @@ class CutPoints:
 
     start: EdgePoints | DualPoints
     end: EdgePoints | DualPoints
-    t: Any  # Float in (0, 1), attached to both fields
+    t: Float  # in (0, 1), attached to both fields
 
     @property
     def count(self) -> int:
         return self.start.count
 
-    def apply(self, fetch: Callable[[Any], Any]) -> Any:
+    def apply(self, fetch: Callable[[UInt32], ArrayT]) -> ArrayT:
         return _lerp(self.start.apply(fetch), self.end.apply(fetch), self.t)
 
-    def entries(self) -> list[tuple[Any, Any, Any]]:
+    def entries(self) -> list[tuple[UInt32, UInt32, Float]]:
         return [
             (point, vertex, weight * gather(type(share), share, point))
             for points, share in ((self.start, 1 - self.t), (self.end, self.t))
@@ -91,21 +92,25 @@ class CutPoints:
         ]
 
 
+Points: TypeAlias = EdgePoints | DualPoints | CutPoints
+"""Points on the lattice of any kind."""
+
+
 @dataclass(frozen=True)
 class Stencil:
     """How mesh vertices interpolate the lattice: blocks of points, one after the other."""
 
-    blocks: tuple[EdgePoints | DualPoints | CutPoints, ...]
+    blocks: tuple[Points, ...]
 
     @property
     def count(self) -> int:
         return sum(block.count for block in self.blocks)
 
-    def apply(self, fetch: Callable[[Any], Any]) -> Any:
+    def apply(self, fetch: Callable[[UInt32], ArrayT]) -> ArrayT:
         """The values at the mesh vertices of what ``fetch`` returns for lattice vertex ids."""
         return concatenate([block.apply(fetch) for block in self.blocks])
 
-    def entries(self) -> list[tuple[Any, Any, Any]]:
+    def entries(self) -> list[tuple[UInt32, UInt32, Float]]:
         """The interpolation as a sparse matrix: arrays of (mesh vertex, lattice vertex, weight)."""
         first, result = 0, []
         for block in self.blocks:
@@ -123,11 +128,11 @@ class SurfaceMesh:
     used once; the mesh is an edge- and vertex-manifold whose boundary vertices have two boundary edges.
     """
 
-    vertices: Any
+    vertices: Array3f
     """Positions, Dr.Jit ``Array3f``, in lattice units ([-1, 1]^3)."""
-    faces: Any
+    faces: Array3u
     """Vertex indices, Dr.Jit ``Array3u``."""
-    msdf: Any
+    msdf: Float
     """mSDF at the vertices, ``Float``: >= 0 on an open surface, 0 where it was cut."""
     lattice_vertex_count: int
     """Values that a field given to ``interpolate`` must have."""
@@ -138,7 +143,7 @@ class SurfaceMesh:
     ``kept_vertex_count`` vertices are the first ones of this mesh."""
     kept_vertex_count: int = 0
     """Vertices of the template that stay; the vertices after them lie on the cut."""
-    cells: Any = None
+    cells: UInt32 | None = None
     """Lowest lattice vertices of the cells that the template passes through, and few others; ascending."""
 
     @property
@@ -153,7 +158,7 @@ class SurfaceMesh:
     def is_empty(self) -> bool:
         return self.face_count == 0
 
-    def interpolate(self, field: Any, channels: int = 1) -> Any:
+    def interpolate(self, field: AnyArray, channels: int = 1) -> AnyArray:
         """Interpolates any lattice field at the vertices with the weights that made their positions.
 
         Args:
@@ -178,7 +183,7 @@ class SurfaceMesh:
             return dr.zeros(kind, 0)
         return self.stencil.apply(lambda vertex: gather(kind, field, vertex))
 
-    def vertex_normals(self) -> Any:
+    def vertex_normals(self) -> Array3f:
         """Unit normals at the vertices, weighted by area; ``Array3f``, differentiable."""
         kind = type(self.vertices)
         if self.is_empty:
@@ -208,7 +213,7 @@ class SurfaceMesh:
         return trimesh.Trimesh(vertices, faces, vertex_attributes={"msdf": msdf}, process=False)
 
 
-def gather(kind: type, source: Any, index: Any) -> Any:
+def gather(kind: type[ArrayT], source: AnyArray, index: UInt32) -> ArrayT:
     """``dr.gather`` whose adjoint is the same kernel for every size of ``source``.
 
     The default strategy for the adjoint of small arrays (``dr.ReduceMode.Expand``) writes their size into
@@ -217,12 +222,12 @@ def gather(kind: type, source: Any, index: Any) -> Any:
     return dr.gather(kind, source, index, mode=dr.ReduceMode.Local)
 
 
-def _lerp(start: Any, end: Any, t: Any) -> Any:
+def _lerp(start: ArrayT, end: ArrayT, t: Float) -> ArrayT:
     # Not start + t (end - start), whose difference may overflow.
     return (1 - t) * start + t * end
 
 
-def concatenate(values: list) -> Any:
+def concatenate(values: Sequence[ArrayT]) -> ArrayT:
     """``dr.concat`` for Dr.Jit arrays of changing sizes: no size ends up in a kernel's code."""
     if len(values) == 1:
         return values[0]

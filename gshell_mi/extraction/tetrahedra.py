@@ -7,10 +7,10 @@ is clipped where it is negative. A cell owns the 7 edges and 12 faces whose lowe
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 
+from ..arrays import Array3u, UInt32
 from ..lattice.sign_words import expand
 from . import tet_tables as tables
 from .grid_extraction import ActiveCells, MarchingExtraction
@@ -21,30 +21,30 @@ from .surface_mesh import concatenate
 class _Polygons:
     """Isosurface polygons, one per active tetrahedron."""
 
-    base: Any  # lowest lattice vertex of the cell
-    key: Any  # entry in the tables: tetrahedron * 256 + signs of the cell's corners
-    quad: Any  # 1 if there are four vertices, else 0
-    corners: list  # their mesh vertices; the fourth of a triangle is its first
+    base: UInt32  # lowest lattice vertex of the cell
+    key: UInt32  # entry in the tables: tetrahedron * 256 + signs of the cell's corners
+    quad: UInt32  # 1 if there are four vertices, else 0
+    corners: list[UInt32]  # their mesh vertices; the fourth of a triangle is its first
 
-    def at(self, index: Any) -> "_Polygons":
+    def at(self, index: UInt32) -> "_Polygons":
         uint_t = type(index)
         base, key, quad, *corners = (
             dr.gather(uint_t, x, index) for x in (self.base, self.key, self.quad, *self.corners)
         )
         return _Polygons(base, key, quad, corners)
 
-    def renumbered(self, order: Any) -> "_Polygons":
+    def renumbered(self, order: UInt32) -> "_Polygons":
         result = replace(self, corners=[dr.gather(type(order), order, c) for c in self.corners])
         dr.eval(result.corners)
         return result
 
 
-class TetExtraction(MarchingExtraction):
+class TetExtraction(MarchingExtraction[_Polygons]):
     """Marching tetrahedra."""
 
     EDGE_DIFFERENCES = 0b11111110
 
-    def polygons(self, cells: ActiveCells, record: Any) -> _Polygons:
+    def polygons(self, cells: ActiveCells, record: UInt32) -> _Polygons:
         owner, tet = expand(self.active_tets(cells), 3)
         base = dr.gather(self.uint_t, cells.cell, owner)
         key = tet * 256 + dr.gather(self.uint_t, cells.signs, owner)
@@ -60,12 +60,12 @@ class TetExtraction(MarchingExtraction):
         dr.eval(base, key, quad, corners)
         return polygons
 
-    def active_tets(self, cells: ActiveCells) -> Any:
+    def active_tets(self, cells: ActiveCells) -> UInt32:
         """Per cell, bit i: the surface passes through its tetrahedron i."""
         table = self.uint_t(tables.active_tets_table())
         return dr.gather(self.uint_t, table, cells.signs, cells.border == 0)
 
-    def triangulate(self, polygons: _Polygons, slots: Any = None) -> Any:
+    def triangulate(self, polygons: _Polygons, slots: UInt32 | None = None) -> Array3u:
         """Triangles of whole polygons; a quad is split from its first to its third vertex.
 
         Args:
@@ -79,7 +79,8 @@ class TetExtraction(MarchingExtraction):
         dr.eval(faces)
         return faces
 
-    def clip(self, polygons: _Polygons, record: Any, count: int, kept_count: int) -> tuple[Any, Any, Any]:
+    def clip(self, polygons: _Polygons, record: UInt32, count: int,
+             kept_count: int) -> tuple[Array3u, UInt32, UInt32]:
         kept_opaque = dr.opaque(self.uint_t, kept_count)
         stays = [c < kept_opaque for c in polygons.corners]
         kept = dr.zeros(self.uint_t)

@@ -1,13 +1,14 @@
 """Cutting a triangle mesh by the sign at its vertices, with names for its edges instead of a search."""
 
-from typing import Any
 
 import drjit as dr
 
+from ..arrays import Array3u, UInt32
 from .surface_mesh import concatenate
 
 
-def cut_triangles(faces: Any, names: Any, name_count: int, kept_count: int) -> tuple[Any, Any, Any]:
+def cut_triangles(faces: Array3u, names: Array3u, name_count: int,
+                  kept_count: int) -> tuple[Array3u, UInt32, UInt32]:
     """The part of a mesh around its first vertices, which ends within the edges to the others.
 
     Args:
@@ -64,7 +65,7 @@ def cut_triangles(faces: Any, names: Any, name_count: int, kept_count: int) -> t
     return concatenate(parts), starts, ends
 
 
-def _take(values: Any, index: Any) -> Any:
+def _take(values: Array3u, index: UInt32) -> Array3u:
     if dr.width(index) == 0:
         return dr.zeros(type(values), 0)
     taken = type(values)(*(dr.gather(type(index), component, index) for component in values))
@@ -72,7 +73,7 @@ def _take(values: Any, index: Any) -> Any:
     return taken
 
 
-def _turned(values: Any, turn: Any) -> list:
+def _turned(values: Array3u, turn: UInt32) -> list[UInt32]:
     return [
         dr.select(turn == 0, values[i], dr.select(turn == 1, values[(i + 1) % 3], values[(i + 2) % 3]))
         for i in range(3)

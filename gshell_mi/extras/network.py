@@ -194,7 +194,7 @@ class NetworkFields(Parametrisation):
         importance = dr.rcp(dr.square(cell) + dr.square(0.25 * distance))
         errors = {name: dr.mean(square if name == "deform" else importance * square)
                   for name, square in squares.items()}
-        total = sum(errors.values())
+        total = mi.Float(sum(errors.values()))
         dr.backward(total)
         self._adam_step(self.fitting_rate * 0.01 ** (iteration / self.fitting_steps))
         return {"loss": total[0]} | {name: error[0] for name, error in errors.items()}

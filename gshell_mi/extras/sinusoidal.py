@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from drjit import nn
 
+from ..arrays import ArrayT
 from .network import NetworkFields, layers, uniform_weights
 
 #: Angular frequency of the activations, in radians per unit of their input.
@@ -22,7 +23,7 @@ class Sine(nn.Module):
 
     DRJIT_STRUCT: ClassVar[dict] = {}
 
-    def __call__(self, arg):
+    def __call__(self, arg: ArrayT) -> ArrayT:
         return dr.sin(_FREQUENCY * arg)
 
 

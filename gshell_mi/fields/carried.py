@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Literal
 
 import drjit as dr
 
+from ..arrays import Bool, Float, UInt32
 from ..lattice import MISSING, BlockLattice
 from ..lattice.sign_words import is_set
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 
 class Carried:
@@ -26,7 +30,7 @@ class Carried:
         self.before, self.after = before, after
 
     @classmethod
-    def following(cls, before: BlockLattice, cells: Any, sdf: Any, *, keep: bool) -> Carried:
+    def following(cls, before: BlockLattice, cells: UInt32, sdf: Float, *, keep: bool) -> Carried:
         """To the blocks around a surface.
 
         Args:
@@ -36,7 +40,7 @@ class Carried:
         """
         moves: list[Carried] = []
 
-        def extended(after: BlockLattice) -> Any:
+        def extended(after: BlockLattice) -> Float:
             moves.append(cls(before, after))
             return moves[0].sdf(sdf)
 
@@ -50,7 +54,7 @@ class Carried:
         return dr.width(before) == dr.width(after) and bool(dr.all(before == after)[0])
 
     @cached_property
-    def _sources(self) -> tuple[Any, Any]:
+    def _sources(self) -> tuple[UInt32, UInt32]:
         """The old vertex that each new one takes its value from, and how many cells away it is."""
         source = self.after.find_in(self.before)
         uint_t = type(source)
@@ -77,15 +81,15 @@ class Carried:
             unknown = dr.compress(source == MISSING)
         return source, distance
 
-    def values(self, field: Any) -> Any:
+    def values(self, field: Float) -> Float:
         """A flat field with any number of channels per stored vertex."""
         return self._gather(field, True)
 
-    def moments(self, field: Any) -> Any:
+    def moments(self, field: Float) -> Float:
         """The same for what an optimiser remembers: new vertices have no past."""
         return self._gather(field, self._sources[1] == 0)
 
-    def sdf(self, field: Any) -> Any:
+    def sdf(self, field: Float) -> Float:
         """A signed distance in lattice units."""
         float_t = type(field)
         source, distance = self._sources
@@ -95,7 +99,7 @@ class Carried:
         outward = dr.select(is_set(self.before.signs(field), source), -size, size)
         return dr.select(distance == 0, value, outward)
 
-    def optimizer(self, optimizer: Any, names: Iterable[str]) -> None:
+    def optimizer(self, optimizer: mi.ad.Adam, names: Iterable[str]) -> None:
         """Carries parameters of an ``mi.ad.Adam`` and its moments along.
 
         Args:
@@ -111,7 +115,7 @@ class Carried:
             dr.eval(first, second, largest)
             optimizer.state[name] = carried, promoted, rate, (step, first, second, largest)
 
-    def _gather(self, field: Any, stays: Any) -> Any:
+    def _gather(self, field: Float, stays: Bool | Literal[True]) -> Float:
         source = self._sources[0]
         uint_t = type(source)
         channels = dr.width(field) // self.before.vertex_count

@@ -19,8 +19,9 @@ class Interpolation:
     """
 
     def __init__(self, field: mi.Float, lattice: Lattice):
-        kind = _InTetrahedra if isinstance(lattice, BccLattice) else _InCubes
-        self._within = kind(field, lattice, dr.width(field) // lattice.vertex_count)
+        channels = dr.width(field) // lattice.vertex_count
+        self._within = (_InTetrahedra(field, lattice, channels) if isinstance(lattice, BccLattice)
+                        else _InCubes(field, lattice, channels))
 
     def __call__(self, points: mi.Point3f) -> mi.Float:
         """The values at points in lattice units, channels interleaved."""

@@ -6,13 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .. import memory
 from ..errors import UserError
 from ..lattice import BlockLattice, Lattice, block_count, lattice_of, make_lattice
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 #: Steps that find the point an offset has brought somewhere; the error halves with each, or better.
 _FIXED_POINT_STEPS = 4
@@ -102,7 +105,7 @@ class LatticeFields:
         old, new = self.lattice, make_lattice(self.grid, resolution or self.lattice.resolution)
         if new == old:
             given = {name: mi.Float(getattr(self, name)) for name in ("sdf", "msdf", "deform")}
-            blocks = BlockLattice.around(old, given["sdf"])
+            blocks = BlockLattice.around(new, given["sdf"])
             fields = {name: blocks.take(field) for name, field in given.items()}
         else:
             resampled = self._resampler(new)
@@ -111,14 +114,16 @@ class LatticeFields:
         return LatticeFields(**{name: field.numpy() for name, field in fields.items()}, grid=self.grid,
                              blocks=blocks.blocks.numpy(), block_resolution=new.resolution)
 
-    def _resampler(self, lattice: Lattice) -> Callable[[Any], dict[str, Any]]:
+    def _resampler(self, lattice: Lattice) -> Callable[[mi.Point3f], dict[str, mi.Float]]:
         """From vertices of another lattice to its fields there, such that the surface stays in place."""
         import drjit as dr
         import mitsuba as mi
 
         from .interpolation import Interpolation
 
-        at = {name: Interpolation(mi.Float(getattr(self, name)), self.lattice)
+        own = self.lattice
+        assert isinstance(own, Lattice), "what is stored in blocks is not resampled"
+        at = {name: Interpolation(mi.Float(getattr(self, name)), own)
               for name in ("sdf", "msdf", "deform")}
 
         def offset(vertices: mi.Point3f) -> mi.Vector3f:
@@ -137,11 +142,11 @@ class LatticeFields:
 
     def save(self, path: str | Path) -> None:
         """Writes a compressed .npz with the arrays ``sdf``, ``msdf``, ``deform`` and, if any, the others."""
-        weights = {} if self.weights is None else {"weights": self.weights}
+        others: dict[str, Any] = {} if self.weights is None else {"weights": self.weights}
         if self.blocks is not None:
-            weights |= {"blocks": self.blocks, "block_resolution": np.array(self.block_resolution)}
+            others |= {"blocks": self.blocks, "block_resolution": np.array(self.block_resolution)}
         with open(path, "wb") as file:  # a file object, as NumPy would append .npz to other names
-            np.savez_compressed(file, sdf=self.sdf, msdf=self.msdf, deform=self.deform, **weights)
+            np.savez_compressed(file, sdf=self.sdf, msdf=self.msdf, deform=self.deform, **others)
 
     @classmethod
     def load(cls, path: str | Path, grid: str = "tet") -> LatticeFields:

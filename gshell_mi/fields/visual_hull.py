@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,7 +14,7 @@ from .mask_outline import mask_distance, sharp
 
 
 def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray], *,
-                daylight_votes: float = 0.06, progress=None) -> mi.Float:
+                daylight_votes: float = 0.06, progress: Callable[[], object] | None = None) -> mi.Float:
     """Signed distance to the visual hull at ``points``, negative inside.
 
     Each view bounds the object by the cone over its mask; the hull is their intersection, the

@@ -1,5 +1,5 @@
 """Integrators whose gradients include the motion of silhouettes; registered as Mitsuba plugins.
 
 The modules ``gshell_path`` and ``gshell_mask`` define plugin classes and are loaded by
-:mod:`gshell_mi.plugins` once a variant is set; nothing here imports them.
+``plugins`` once a variant is set; nothing here imports them.
 """

@@ -1,23 +1,30 @@
 """The samples of a film: where they are, and which of them a derivative depends on."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
+
+if TYPE_CHECKING:
+    from .film_integrator import FilmIntegrator
+    from .reparameterised_film import Warp
 
 
 @dataclass
 class CameraSamples:
     """Positions on the film and the other random numbers that a sensor needs."""
 
-    u: object           #: ``Point2f``: pixels relative to the crop window
-    time: object        #: ``Float``
-    wavelength: object  #: ``Float``
-    origin: tuple       #: lowest pixel sampled, relative to the crop window
-    size: tuple         #: extent in pixels of what is sampled
+    u: mi.Point2f  #: pixels relative to the crop window
+    time: mi.Float
+    wavelength: mi.Float
+    origin: tuple[int, int]  #: lowest pixel sampled, relative to the crop window
+    size: tuple[int, int]    #: extent in pixels of what is sampled
 
     @staticmethod
-    def draw(sensor, sampler):
+    def draw(sensor: mi.Sensor, sampler: mi.Sampler) -> CameraSamples:
         film = sensor.film()
         border = film.rfilter().border_size() if film.sample_border() else 0
         width, height = (int(n) + 2 * border for n in film.crop_size())
@@ -32,25 +39,27 @@ class CameraSamples:
         wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
         return CameraSamples(u, time, wavelength, (-border, -border), (width, height))
 
-    def take(self, index):
+    def take(self, index: mi.UInt32) -> CameraSamples:
         """The samples with these numbers."""
         time, wavelength = (x if dr.width(x) == 1 else dr.gather(mi.Float, x, index)
                             for x in (self.time, self.wavelength))
         return CameraSamples(dr.gather(mi.Point2f, self.u, index), time, wavelength, self.origin, self.size)
 
-    def rays(self, sensor, u):
+    def rays(self, sensor: mi.Sensor, u: mi.Point2f) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Camera rays through film positions, attached to them and to the sensor."""
         film = sensor.film()
         return sensor.sample_ray(self.time, self.wavelength, u / mi.Vector2f(film.crop_size()),
                                  mi.Point2f(0.5))
 
 
-def numbers_of(selected):
+def numbers_of(selected: mi.Bool) -> mi.UInt32:
     """The numbers of the selected samples, and the first two: kernels for none or one would be others."""
     return dr.compress(selected | (dr.arange(mi.UInt32, dr.width(selected)) < 2))
 
 
-def not_lost(integrator, scene, sensor, samples, sampler, warp, seed):
+def not_lost(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, samples: CameraSamples,
+             sampler: mi.Sampler, warp: Warp,
+             seed: int) -> tuple[mi.UInt32 | None, CameraSamples, mi.Sampler]:
     """The samples that see something or are close to a silhouette.
 
     The others are black whatever changes, so nothing need be traced for them: on a photograph of one object

@@ -5,10 +5,14 @@ milliseconds and must not compile kernels anew. A hash table with open addressin
 compare-and-swap, does both; no sort is needed.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+
+from ..arrays import ArrayT
 
 _EMPTY = 0xFFFFFFFF
 
@@ -17,19 +21,15 @@ SIZE_INDEPENDENT = dr.ReduceMode.Local
 
 
 @dr.syntax
-def first_with_equal_key(keys, active):
+def first_with_equal_key(keys: list[mi.UInt32], active: mi.Bool) -> mi.UInt32:
     """For each entry the index of the first entry that has an equal key.
 
-    Parameters
-    ----------
-    keys:
-        List of ``UInt32`` arrays of one width ``n``: the words of the keys.
-    active:
-        ``Bool``, width ``n``: entries that take part. Others get ``0xFFFFFFFF``.
+    Args:
+        keys: list of ``UInt32`` arrays of one width ``n``: the words of the keys.
+        active: ``Bool``, width ``n``: entries that take part. Others get ``0xFFFFFFFF``.
 
-    Returns
-    -------
-    ``UInt32``, width ``n``.
+    Returns:
+        ``UInt32``, width ``n``.
 
     >>> key = mi.UInt32(7, 5, 7, 9)
     >>> r = first_with_equal_key([key], mi.Bool(True, True, True, False))
@@ -75,27 +75,24 @@ def first_with_equal_key(keys, active):
 class EdgeTable:
     """The directed edges of a mesh (three per face, in face order) and the edge each belongs to."""
 
-    start: object       #: ``UInt32``, 3F: first vertex, an index into the mesh's own vertex buffer
-    end: object         #: ``UInt32``, 3F: second vertex
-    edge: object        #: ``UInt32``, 3F: representative directed edge
-    forward: object     #: ``Bool``, 3F: whether it runs from the lower to the higher welded vertex
-    valid: object       #: ``Bool``, 3F: false for the edges of degenerate faces
-    split: object       #: ``Bool``, 3F: its faces have different copies of an end point (at representatives)
-    degree: object      #: ``Int32``, 3F: number of faces at the edge, stored at its representative
+    start: mi.UInt32  #: 3F: first vertex, an index into the mesh's own vertex buffer
+    end: mi.UInt32    #: 3F: second vertex
+    edge: mi.UInt32   #: 3F: representative directed edge
+    forward: mi.Bool  #: 3F: whether it runs from the lower to the higher welded vertex
+    valid: mi.Bool    #: 3F: false for the edges of degenerate faces
+    split: mi.Bool    #: 3F: its faces have different copies of an end point (at representatives)
+    degree: mi.Int32  #: 3F: number of faces at the edge, stored at its representative
 
 
-def build_edge_table(positions, faces) -> EdgeTable:
+def build_edge_table(positions: mi.Float, faces: mi.UInt32) -> EdgeTable:
     """The edges of a mesh, vertices at exactly the same position counting as one.
 
     Welding by position keeps texture seams from looking like open boundaries. Faces with two equal
     (welded) corners are left out, so padding by degenerate faces is free.
 
-    Parameters
-    ----------
-    positions:
-        ``Float``, 3V, interleaved.
-    faces:
-        ``UInt32``, 3F, vertex indices.
+    Args:
+        positions: ``Float``, 3V, interleaved.
+        faces: ``UInt32``, 3F, vertex indices.
 
     >>> quad = mi.Float(0, 0, 0,  1, 0, 0,  1, 1, 0,  0, 1, 0)
     >>> table = build_edge_table(quad, mi.UInt32(0, 1, 2,  0, 2, 3,  0, 0, 0))
@@ -133,14 +130,14 @@ def build_edge_table(positions, faces) -> EdgeTable:
     return EdgeTable(start, end, edge, forward, valid, split, degree)
 
 
-def scene_edge_tables(scene):
-    """Pairs of each mesh of the scene that has faces and its :class:`EdgeTable`."""
+def scene_edge_tables(scene: mi.Scene) -> list[tuple[mi.Mesh, EdgeTable]]:
+    """Pairs of each mesh of the scene that has faces and its ``EdgeTable``."""
     return [(shape, build_edge_table(shape.vertex_positions_buffer(), shape.faces_buffer()))
             for shape in scene.shapes()
             if shape.is_mesh() and shape.face_count() > 0 and shape.vertex_count() > 2]
 
 
-def join(arrays):
+def join(arrays: list[ArrayT]) -> ArrayT:
     """One array of several; ``dr.concat`` would bake the sizes into the kernel, scattering does not."""
     if len(arrays) == 1:
         return arrays[0]

@@ -6,12 +6,15 @@ These directions fill two opposite lunes around the axis, between the planes of 
 An edge of one face has lunes of half the sphere, one between coplanar faces none.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from .edge_table import SIZE_INDEPENDENT, join
+from ..arrays import AnyArray
+from .edge_table import SIZE_INDEPENDENT, EdgeTable, join
 from .silhouette_edges import crease_mask
 
 #: Narrower lunes (radians) are those of flat faces, whose angle rounding errors make up.
@@ -22,21 +25,21 @@ _FLAT = 1e-4
 class EdgeWedges:
     """Edges of all meshes; angles are around the axis from the first face, ``low <= 0 <= high``."""
 
-    positions: object   #: ``Float``, attached: the vertices of all meshes, interleaved
-    start: object       #: ``UInt32``: first vertex
-    end: object         #: ``UInt32``: second vertex
-    opposite: object    #: ``UInt32``: third vertex of the first face
-    low: object         #: ``Float``: lowest angle of a face, above -pi
-    high: object        #: ``Float``: highest angle of a face, below pi
-    crease: object      #: ``Bool``: whether the film warp follows it wherever it is seen
-    meshes: int         #: how many meshes have edges
-    mesh_mass: object   #: ``Float``: sum of length times opening over the edges of its mesh
+    positions: mi.Float  #: attached: the vertices of all meshes, interleaved
+    start: mi.UInt32     #: first vertex
+    end: mi.UInt32       #: second vertex
+    opposite: mi.UInt32  #: third vertex of the first face
+    low: mi.Float        #: lowest angle of a face, above -pi
+    high: mi.Float       #: highest angle of a face, below pi
+    crease: mi.Bool      #: whether the film warp follows it wherever it is seen
+    meshes: int          #: how many meshes have edges
+    mesh_mass: mi.Float  #: sum of length times opening over the edges of its mesh
 
-    def opening(self):
+    def opening(self) -> mi.Float:
         """Width in radians of each lune."""
         return dr.pi - (self.high - self.low)
 
-    def frame(self, index):
+    def frame(self, index: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f, mi.Vector3f, mi.Vector3f, mi.Vector3f]:
         """Of edges by index: end points, unit axis, and the unit vectors at angles 0 and 90 degrees."""
         flat = dr.detach(self.positions)
         p, q, r = (dr.gather(mi.Point3f, flat, dr.gather(mi.UInt32, x, index))
@@ -44,21 +47,23 @@ class EdgeWedges:
         return p, q, *_frame(p, q, r)
 
 
-def _frame(p, q, r):
+def _frame(p: mi.Point3f, q: mi.Point3f, r: mi.Point3f) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
     axis = dr.normalize(q - p)
     inward = r - p
     inward = dr.normalize(inward - axis * dr.dot(axis, inward))
     return axis, inward, dr.cross(axis, inward)
 
 
-def silhouette_for(direction, inward, across, low, high):
+def silhouette_for(direction: mi.Vector3f, inward: mi.Vector3f, across: mi.Vector3f, low: mi.Float,
+                   high: mi.Float) -> mi.Bool:
     """Whether a line of the given direction through an edge has all its faces on one side."""
     x, y = dr.dot(direction, inward), dr.dot(direction, across)
     at_low, at_high = (y * dr.cos(a) - x * dr.sin(a) for a in (low, high))
     return (at_low * at_high > 0) & (dr.pi - (high - low) > _FLAT)
 
 
-def build_edge_wedges(tables, crease_angle=0.1):
+def build_edge_wedges(tables: list[tuple[mi.Mesh, EdgeTable]],
+                      crease_angle: float = 0.1) -> EdgeWedges | None:
     """The wedges of all edges of the meshes of ``scene_edge_tables``, or ``None`` without edges."""
     parts, buffers, offset = [], [], 0
     for mesh, table in tables:
@@ -73,10 +78,11 @@ def build_edge_wedges(tables, crease_angle=0.1):
     with dr.resume_grad():
         positions = join(buffers)
     columns = [join([part[k] for part in parts]) for k in range(len(parts[0]))]
-    return EdgeWedges(positions, *columns[:-1], len(parts), columns[-1])
+    return EdgeWedges(positions, *columns[:-1], meshes=len(parts), mesh_mass=columns[-1])
 
 
-def _mesh_wedges(mesh, table, crease_angle, offset):
+def _mesh_wedges(mesh: mi.Mesh, table: EdgeTable, crease_angle: float,
+                 offset: mi.UInt32) -> list[AnyArray] | None:
     positions, faces = dr.detach(mesh.vertex_positions_buffer()), mesh.faces_buffer()
     n = dr.width(faces)
     corner = dr.arange(mi.UInt32, n)

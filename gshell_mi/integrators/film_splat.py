@@ -14,6 +14,9 @@ left would depend on the pixel of i.) That image is a filtered one of the pixels
 will do, and this one needs no atomic additions per sample.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
 from copy import copy
 
 import drjit as dr
@@ -23,20 +26,15 @@ import mitsuba as mi
 class FilmSplat:
     """The derivative of a film with respect to the values and positions of its samples.
 
-    Parameters
-    ----------
-    film:
-        The film; its filter, crop window and ``sample_border`` are honoured.
-    spp:
-        Samples per pixel.
-    u:
-        ``Point2f``: sample positions in pixels relative to the crop window.
-    values:
-        List of ``Float``: the channels of each sample, which ``adjoint`` and ``tangent`` need. They
-        also take the samples to be in the order of their pixels.
+    Args:
+        film: the film; its filter, crop window and ``sample_border`` are honoured.
+        spp: samples per pixel.
+        u: ``Point2f``: sample positions in pixels relative to the crop window.
+        values: list of ``Float``: the channels of each sample, which ``adjoint`` and ``tangent`` need. They
+            also take the samples to be in the order of their pixels.
     """
 
-    def __init__(self, film, spp, u, values=()):
+    def __init__(self, film: mi.Film, spp: int, u: mi.Point2f, values: Sequence[mi.Float] = ()) -> None:
         self.spp, self.u, self.values = spp, dr.detach(u), [dr.detach(v) for v in values]
         self.width, self.height = film.crop_size()
         self.rfilter = film.rfilter()
@@ -50,7 +48,7 @@ class FilmSplat:
         self.expected = [self._expected_weight(n) for n in (self.width, self.height)]
         self.expected[0] *= spp
 
-    def _expected_weight(self, n):
+    def _expected_weight(self, n: int) -> mi.Float:
         """Integral over the sampled interval of the filter at each of n pixels, one axis."""
         if self.box:
             return dr.ones(mi.Float, n)
@@ -68,7 +66,7 @@ class FilmSplat:
         dr.eval(total)
         return total
 
-    def _filter(self, axis):
+    def _filter(self, axis: int) -> list[tuple[mi.Float, mi.Float]]:
         """Filter value and slope at each tap along one axis."""
         result = []
         for k in range(self.taps):
@@ -85,7 +83,7 @@ class FilmSplat:
             result.append((dr.detach(h), slope))
         return result
 
-    def _taps(self):
+    def _taps(self) -> Iterator[tuple[mi.UInt32, mi.Bool, mi.Float, mi.Vector2f, mi.Float]]:
         """Yields pixel index, whether it lies in the film, weight and its gradient for each tap."""
         along_x, along_y = self._filter(0), self._filter(1)
         for j, (hy, sy) in enumerate(along_y):
@@ -98,7 +96,7 @@ class FilmSplat:
                 scale = dr.select(inside, dr.rcp(ex * ey), 0)
                 yield mi.UInt32(y * self.width + x), inside, hx * hy, mi.Vector2f(sx * hy, hx * sy), scale
 
-    def _control(self):
+    def _control(self) -> list[mi.Float]:
         """Per half of the samples and pixel a rough image of the values, made of the other half.
 
         Its pixels are those of the film without border; the second half follows the first.
@@ -134,7 +132,7 @@ class FilmSplat:
         dr.eval(result)
         return result
 
-    def mean_control(self):
+    def mean_control(self) -> list[mi.Float]:
         """Per pixel and channel what is subtracted from the samples on average."""
         n = self.width * self.height
         pixel = dr.arange(mi.UInt32, n)
@@ -143,12 +141,12 @@ class FilmSplat:
         return [share * dr.gather(mi.Float, c, pixel) + (1 - share) * dr.gather(mi.Float, c, second)
                 for c in self._control()]
 
-    def _half(self, index):
+    def _half(self, index: mi.UInt32) -> mi.UInt32:
         """Which half the samples with these numbers belong to."""
         spp = dr.opaque(mi.UInt32, self.spp)
         return (index - index // spp * spp) & 1
 
-    def gather(self, image):
+    def gather(self, image: list[mi.Float]) -> list[mi.Float]:
         """Per sample and channel the filtered image value: the adjoint of splatting values."""
         result = [mi.Float(0) for _ in image]
         for pixel, inside, h, _, scale in self._taps():
@@ -156,7 +154,7 @@ class FilmSplat:
                 result[c] += h * scale * dr.gather(mi.Float, channel, pixel, inside)
         return result
 
-    def scatter(self, values):
+    def scatter(self, values: list[mi.Float]) -> list[mi.Float]:
         """The image of samples with the given channels."""
         result = [dr.zeros(mi.Float, self.width * self.height) for _ in values]
         for pixel, inside, h, _, scale in self._taps():
@@ -165,7 +163,7 @@ class FilmSplat:
         dr.eval(result)
         return result
 
-    def take(self, index):
+    def take(self, index: mi.UInt32) -> FilmSplat:
         """The splat of the samples with these numbers, as far as taps are concerned."""
         result = copy(self)
         result.u = dr.gather(mi.Point2f, self.u, index)
@@ -173,7 +171,7 @@ class FilmSplat:
         result.values = [dr.gather(mi.Float, v, index) for v in self.values]
         return result
 
-    def adjoint(self, image_adjoint, index):
+    def adjoint(self, image_adjoint: list[mi.Float], index: mi.UInt32) -> tuple[mi.Vector2f, mi.Float]:
         """Adjoints of the displacement T(u) - u and of det of some samples, for an image adjoint.
 
         ``image_adjoint``: list of ``Float``, one per channel, width pixels; ``index``: ``UInt32``, which
@@ -198,7 +196,8 @@ class FilmSplat:
             on_det += h * contrast
         return on_shift, on_det
 
-    def tangent(self, value_tangents, shift, divergence):
+    def tangent(self, value_tangents: list[mi.Float], shift: mi.Vector2f,
+                divergence: mi.Float) -> list[mi.Float]:
         """The image tangent for tangents of the values, of T(u) - u and of det."""
         control = self._control()
         half = self._half(dr.arange(mi.UInt32, dr.width(self.u)))

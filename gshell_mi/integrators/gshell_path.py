@@ -1,15 +1,24 @@
 """The reparameterised path integrator ``gshell_path``."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
+from ..arrays import AnyArray
 from ..errors import UserError
 from ..timing import phase
 from . import primal_film, reparameterised_film, shadow_boundary
+from .edge_table import EdgeTable
+from .film_integrator import OnSample
 from .path_replay import replay
 from .path_sample import PathSample
 from .path_vertex import delta_lobe, material_point, mis_weight, sample_direct, scattering, segment
+from .shadow_boundary import BoundaryTerm
 from .supported_scenes import check_meshes, has_bsdf_flag, has_surface_emitters
 
 
@@ -17,11 +26,11 @@ class GShellPathIntegrator(ADIntegrator):
     """Path integrator whose derivatives include those of visibility.
 
     Primary visibility moves by a warp of the film that follows the silhouettes
-    (:mod:`~gshell_mi.integrators.warp`); what the first surface receives, by the shadow boundaries on
-    the film (:mod:`~gshell_mi.integrators.shadow_boundary`). Derivatives reach vertex positions, mesh
+    (``warp``); what the first surface receives, by the shadow boundaries on
+    the film (``shadow_boundary``). Derivatives reach vertex positions, mesh
     attributes, BSDFs, emitters and the sensor's ``to_world`` in one pass; alpha is differentiable.
     Films keep any reconstruction filter, crop window and ``sample_border``. Sensors: ``perspective``;
-    another one raises :class:`~gshell_mi.errors.UserError` when differentiated.
+    another one raises ``UserError`` when differentiated.
 
     Plugin parameters:
 
@@ -38,16 +47,16 @@ class GShellPathIntegrator(ADIntegrator):
       silhouettes do.
     * ``cull_hidden`` (bool, default true): leave out silhouettes that other surfaces hide.
 
-    .. code-block:: xml
+    ```xml
+    <integrator type="gshell_path"> <integer name="max_depth" value="3"/> </integrator>
+    ```
 
-        <integrator type="gshell_path"> <integer name="max_depth" value="3"/> </integrator>
-
-    .. code-block:: python
-
-        integrator = mi.load_dict({'type': 'gshell_path', 'max_depth': 3})
+    ```python
+    integrator = mi.load_dict({'type': 'gshell_path', 'max_depth': 3})
+    ```
     """
 
-    def __init__(self, props):
+    def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.hide_emitters = props.get("hide_emitters", False)
         self.warp_radius = props.get("warp_radius", 2.0)
@@ -55,7 +64,7 @@ class GShellPathIntegrator(ADIntegrator):
         gradient_depth = props.get("gradient_depth", max(self.max_depth, 1))
         if gradient_depth < 1:
             raise UserError(f"gshell_path: gradient_depth is {gradient_depth}, but has to be at least 1.")
-        self.gradient_depth = min(gradient_depth, self.max_depth)
+        self.gradient_depth: int = min(gradient_depth, self.max_depth)
         self.reparam_depth = props.get("reparam_depth", 1)
         if self.reparam_depth not in (1, 2, 3):
             raise UserError(f"gshell_path: reparam_depth is {self.reparam_depth}, but has to be 1, 2 or 3.")
@@ -65,26 +74,32 @@ class GShellPathIntegrator(ADIntegrator):
 
     # ------------------------------------------------------------------ rendering
 
-    def sample(self, mode, scene, sampler, ray, active=True, **kwargs):
+    def sample(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f,
+               active: mi.Bool | bool = True,
+               **kwargs: Any) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], None]:
         check_meshes(scene)
         result = self.primal(scene, sampler, mi.Ray3f(ray), active, max_depth=self.max_depth)
         return result.value, result.alpha > 0.5, result.aovs, None
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+    def render(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0,
+               develop: bool = True, evaluate: bool = True) -> mi.TensorXf:
         if not develop:
             return super().render(scene, sensor, seed, spp, develop, evaluate)
         return primal_film.render(self, scene, sensor, seed, spp)
 
-    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+    def render_forward(self, scene: mi.Scene, params: Any, sensor: int | mi.Sensor = 0, seed: int = 0,
+                       spp: int = 0) -> mi.TensorXf:
         return reparameterised_film.render_forward(self, scene, sensor, seed, spp)
 
-    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+    def render_backward(self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: int | mi.Sensor = 0,
+                        seed: int = 0, spp: int = 0) -> None:
         with phase("render backward"):
             reparameterised_film.render_backward(self, scene, grad_in, sensor, seed, spp)
 
     # ------------------------------------------------------------------ paths
 
-    def first_hit(self, scene, ray, active=True):
+    def first_hit(self, scene: mi.Scene, ray: mi.Ray3f,
+                  active: mi.Bool | bool = True) -> mi.PreliminaryIntersection3f:
         """The first intersection, behind the area lights if emitters are hidden."""
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         if self.hide_emitters and has_surface_emitters(scene):
@@ -94,7 +109,8 @@ class GShellPathIntegrator(ADIntegrator):
         return pi
 
     @dr.syntax
-    def primal(self, scene, sampler, ray, active=True, start=0, max_depth=None):
+    def primal(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool | bool = True,
+               start: int = 0, max_depth: int | None = None) -> PathSample:
         """Radiance and coverage along camera rays, without derivatives; by default, what is differentiated.
 
         With ``start`` = 1 the rays are those of a second segment instead: the light that arrives
@@ -142,7 +158,8 @@ class GShellPathIntegrator(ADIntegrator):
         L = dr.select(dr.all(dr.isfinite(L)), L, 0)
         return PathSample(L, dr.select(covered, mi.Float(1), mi.Float(0)), [])
 
-    def emission(self, scene, si, si_prev, pdf_prev, delta_prev, scattered, active):
+    def emission(self, scene: mi.Scene, si: mi.SurfaceInteraction3f, si_prev: mi.SurfaceInteraction3f,
+                 pdf_prev: mi.Float, delta_prev: mi.Bool, scattered: mi.Bool, active: mi.Bool) -> mi.Spectrum:
         """Light emitted at a vertex towards the one before, weighted against emitter sampling."""
         if self.hide_emitters:
             active = active & (scattered | si.is_valid())
@@ -150,7 +167,8 @@ class GShellPathIntegrator(ADIntegrator):
         emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, ~delta_prev)
         return mis_weight(pdf_prev, emitter_pdf) * ds.emitter.eval(si, active)
 
-    def roulette(self, beta, eta, depth, sampler, active):
+    def roulette(self, beta: mi.Spectrum, eta: mi.Float, depth: mi.UInt32, sampler: mi.Sampler,
+                 active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
         peak = dr.max(mi.unpolarized_spectrum(beta))
         survive = dr.minimum(peak * dr.square(eta), 0.95)
         play = depth >= self.rr_depth
@@ -160,15 +178,18 @@ class GShellPathIntegrator(ADIntegrator):
 
     # ------------------------------------------------------------------ shadows
 
-    def boundary_terms(self, scene, tables, sensor, seed):
-        """Yields the :class:`~gshell_mi.integrators.shadow_boundary.BoundaryTerm` of shadows."""
+    def boundary_terms(self, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor,
+                       seed: int) -> Iterable[BoundaryTerm]:
+        """Yields the ``BoundaryTerm`` of shadows."""
         return shadow_boundary.boundary_terms(self, scene, tables, sensor, seed)
 
-    def replays(self, scene):
+    def replays(self, scene: mi.Scene) -> bool:
         """Whether ``attached`` needs to know the radiance and coverage of its samples beforehand."""
         return self.gradient_depth > 3 or has_bsdf_flag(scene, mi.BSDFFlags.Delta)
 
-    def attached(self, mode, scene, sampler, ray, state, on_sample, film_terms=()):
+    def attached(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f,
+                 state: PathSample | None, on_sample: OnSample,
+                 film_terms: Sequence[AnyArray] = ()) -> tuple[Any, Any]:
         """Derivatives of camera paths.
 
         ``ray`` is attached to the film warp and the sensor; ``state`` is what ``primal`` returned for
@@ -183,7 +204,8 @@ class GShellPathIntegrator(ADIntegrator):
             total = on_sample(radiance, alpha, state.aovs)
             if tail is not None:
                 with dr.suspend_grad():
-                    on_last = replay(self, mode, *tail, _adjoint_of_value(on_sample, state), mi.Vector3f(0))
+                    on_last = replay(self, mode, *tail, adjoint=_adjoint_of_value(on_sample, state),
+                                     p_tangent=mi.Vector3f(0))
                 total += dr.dot(last, on_last)
             return total, state
         # Interior gradients are results too, and the replay needs those of the inputs again.
@@ -192,10 +214,13 @@ class GShellPathIntegrator(ADIntegrator):
         film_tangents = [dr.grad(x) for x in film_terms]
         if tail is not None:
             with dr.suspend_grad():
-                tangent += replay(self, mode, *tail, mi.Spectrum(0), mi.Vector3f(dr.grad(last)))
+                tangent += replay(self, mode, *tail, adjoint=mi.Spectrum(0),
+                                  p_tangent=mi.Vector3f(dr.grad(last)))
         return on_sample(tangent, alpha_tangent, []), film_tangents
 
-    def _first_vertices(self, scene, sampler, ray, state):
+    def _first_vertices(
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, state: PathSample | None,
+    ) -> tuple[mi.Spectrum, mi.Float, mi.Point3f, tuple[Any, ...] | None]:
         """The first two vertices of each path, whose motions depend on each other, attached.
 
         Returns radiance, coverage, the position of the second vertex and what the replay of the
@@ -238,7 +263,7 @@ class GShellPathIntegrator(ADIntegrator):
                 beta, active = self.roulette(beta * weight, eta, depth, sampler, active)
                 pi = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active)
             depth = depth + 1
-            to_point = None
+            to_point = mi.Spectrum(0)   # replaced wherever it counts
             if surface_emitters or vertex == 1:
                 p_next, area_next = material_point(pi, ray_next, active)
                 d, solid_angle = segment(si.p, p_next, area_next, active & pi.is_valid(), ray_next.d)
@@ -272,18 +297,19 @@ class GShellPathIntegrator(ADIntegrator):
 
         if not deeper:
             return radiance, alpha, mi.Point3f(0), None
+        assert state is not None, "replays(scene) has asked for it"
         rest = state.value - dr.detach(radiance)
         radiance += dr.select(active, to_point * rest, 0)
         return radiance, alpha, si.p, (scene, sampler, ray_next, pi, si_now, rest, beta, eta, sample.pdf,
                                        delta, active, depth, scattered)
 
-    def to_string(self):
+    def to_string(self) -> str:
         return (f"GShellPathIntegrator[max_depth={self.max_depth}, rr_depth={self.rr_depth}, "
                 f"gradient_depth={self.gradient_depth}, hide_emitters={self.hide_emitters}, "
                 f"reparam_depth={self.reparam_depth}, warp_radius={self.warp_radius}]")
 
 
-def _adjoint_of_value(on_sample, state):
+def _adjoint_of_value(on_sample: OnSample, state: PathSample) -> mi.Spectrum:
     """Adjoint of the radiance of each sample (``on_sample`` is linear in it)."""
     with dr.resume_grad():
         value = mi.Spectrum(state.value)

@@ -1,15 +1,25 @@
 """Path replay of the vertices after the second."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 
 from .path_vertex import material_point, sample_direct, scattering, segment
 from .supported_scenes import has_bsdf_flag, has_surface_emitters
 
+if TYPE_CHECKING:
+    from .gshell_path import GShellPathIntegrator
+
 
 @dr.syntax
-def replay(integrator, mode, scene, sampler, ray, pi, si_prev, L, beta, eta, pdf_prev, delta_prev, active,
-           depth, scattered, adjoint, p_tangent):
+def replay(integrator: GShellPathIntegrator, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler,
+           ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, si_prev: mi.SurfaceInteraction3f, L: mi.Spectrum,
+           beta: mi.Spectrum, eta: mi.Float, pdf_prev: mi.Float, delta_prev: mi.Bool, active: mi.Bool,
+           depth: mi.UInt32, scattered: mi.Bool, adjoint: mi.Spectrum,
+           p_tangent: mi.Vector3f) -> mi.Vector3f | mi.Spectrum:
     """Path replay (Vicini et al. 2021) of the remaining vertices.
 
     Reverse mode takes the adjoint of the radiance and returns that of the position of the vertex

@@ -8,19 +8,22 @@ non-static geometry"). The Jacobian of a sampled direction is the geometry term 
 of the triangle, both relative to their present values.
 """
 
+from __future__ import annotations
+
 import drjit as dr
 import mitsuba as mi
 
 from ..means import channel_mean
 
 
-def mis_weight(pdf_a, pdf_b):
+def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
     """Power heuristic, without derivatives."""
     a2, b2 = dr.square(dr.detach(pdf_a)), dr.square(dr.detach(pdf_b))
     return dr.select(a2 > 0, a2 / (a2 + b2), 0)
 
 
-def material_point(pi, ray, active):
+def material_point(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f,
+                   active: mi.Bool) -> tuple[mi.Point3f, mi.Vector3f]:
     """The hit as a point of its surface: position and ``n dA``, attached to the shape.
 
     ``n dA`` is the surface normal times the local stretch of area relative to now; only its
@@ -34,7 +37,8 @@ def material_point(pi, ray, active):
     return si.p, si.n * dr.relative_grad(area)
 
 
-def segment(p, p_next, area_next, valid, d):
+def segment(p: mi.Point3f, p_next: mi.Point3f, area_next: mi.Vector3f, valid: mi.Bool,
+            d: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
     """Direction to a material point, and the derivative of its solid angle as a factor of value 1.
 
     ``d``: the direction's present value, kept where ``valid`` is false (the ray left the scene).
@@ -47,15 +51,13 @@ def segment(p, p_next, area_next, valid, d):
     return (dr.replace_grad(d, dr.select(valid, direction, d)), dr.relative_grad(solid_angle))
 
 
-def sample_direct(scene, si, bsdf, sample, active, attached, surface_emitters):
+def sample_direct(scene: mi.Scene, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, sample: mi.Point2f,
+                  active: mi.Bool, attached: bool, surface_emitters: bool) -> mi.Spectrum:
     """Light that one emitter sample sends through the vertex, weighted against BSDF sampling.
 
-    Parameters
-    ----------
-    attached:
-        Whether to track derivatives (a Python ``bool``).
-    surface_emitters:
-        Whether the scene has any area light (a Python ``bool``).
+    Args:
+        attached: whether to track derivatives (a Python ``bool``).
+        surface_emitters: whether the scene has any area light (a Python ``bool``).
     """
     context = mi.BSDFContext()
     active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -85,7 +87,8 @@ def sample_direct(scene, si, bsdf, sample, active, attached, surface_emitters):
     return dr.select(active, dr.select(ds.delta, 1, mis_weight(pdf, bsdf_pdf)) * value * weight, 0)
 
 
-def scattering(bsdf, si, d, solid_angle, sample, active, special):
+def scattering(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, d: mi.Vector3f, solid_angle: mi.Float,
+               sample: mi.BSDFSample3f, active: mi.Bool, special: bool) -> mi.Spectrum:
     """Factor of value 1 with the derivative of scattering towards a point.
 
     Where light just passes through (``mask``), of the transmission; the geometry of such a
@@ -98,7 +101,9 @@ def scattering(bsdf, si, d, solid_angle, sample, active, special):
     return dr.select(passes, dr.relative_grad(bsdf.eval_null_transmission(si, active)), change)
 
 
-def delta_lobe(bsdf, si, ray, ray_next, choice, sample2, delta, active, kind, change):
+def delta_lobe(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, ray_next: mi.Ray3f,
+               choice: mi.Float, sample2: mi.Point2f, delta: mi.Bool, active: mi.Bool, kind: mi.UInt32,
+               change: mi.Spectrum) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
     """Direction, and relative weight and coverage, where the first surface scatters in one direction.
 
     A mirrored or refracted direction follows the surface, and one that passes through (``mask``)

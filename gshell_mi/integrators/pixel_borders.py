@@ -9,26 +9,30 @@ estimated with samples of their own on the borders near silhouettes. (A warp tha
 place is right too, but its divergence near where a silhouette crosses a border has no finite variance.)
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
+
+if TYPE_CHECKING:
+    from .reparameterised_film import Warp
 
 
 class PixelBorders:
     """Samples on pixel borders that the warp moves.
 
-    Parameters
-    ----------
-    film:
-        A film with a box filter.
-    warp:
-        The :class:`~gshell_mi.integrators.reparameterised_film.Warp`.
-    count:
-        Samples per border.
-    sampler:
-        Called with a number, returns an independent sampler for as many samples; kept for further use.
+    Args:
+        film: a film with a box filter.
+        warp: the ``Warp``.
+        count: samples per border.
+        sampler: called with a number, returns an independent sampler for as many samples; kept for further
+            use.
     """
 
-    def __init__(self, film, warp, count, sampler):
+    def __init__(self, film: mi.Film, warp: Warp, count: int, sampler: Callable[[int], mi.Sampler]) -> None:
         self.width, self.height = (int(n) for n in film.crop_size())
         vertical, horizontal = (self.width + 1) * self.height, self.width * (self.height + 1)
         border = dr.arange(mi.UInt32, vertical + horizontal)
@@ -53,18 +57,19 @@ class PixelBorders:
         self.weight = 1 / count
         dr.eval(self.normal, self.u)
 
-    def _pixel(self, side):
+    def _pixel(self, side: int) -> tuple[mi.UInt32, mi.Bool]:
         """Pixels before (-1) and after (1) the borders, and whether they lie in the film."""
         p = mi.Point2i(dr.floor(self.u + 0.5 * side * self.normal))
         inside = (p.x >= 0) & (p.x < self.width) & (p.y >= 0) & (p.y < self.height)
         return mi.UInt32(p.y * self.width + p.x), inside
 
-    def flux(self, warp):
+    def flux(self, warp: Warp) -> mi.Float:
         """How fast the borders are crossed; attached."""
         shifted, _ = warp(self.u)
         return dr.dot(self.normal, mi.Vector2f(shifted - self.u)) * self.weight
 
-    def adjoint(self, image_adjoint, values, control):
+    def adjoint(self, image_adjoint: list[mi.Float], values: list[mi.Float],
+                control: list[mi.Float]) -> mi.Float:
         """Adjoint of the flux. ``values``: the channels on the borders; ``control``: those subtracted
         from the samples inside the pixels, per pixel."""
         total = mi.Float(0)
@@ -75,7 +80,8 @@ class PixelBorders:
                 total += side * dr.gather(mi.Float, g, pixel, inside) * contrast
         return total
 
-    def scatter(self, image, flux, values, control):
+    def scatter(self, image: list[mi.Float], flux: mi.Float, values: list[mi.Float],
+                control: list[mi.Float]) -> None:
         """Adds the tangent that a flux causes to an image."""
         for side in (-1, 1):
             pixel, inside = self._pixel(side)

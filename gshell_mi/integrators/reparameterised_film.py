@@ -1,24 +1,29 @@
 """Forward and reverse derivatives of a film whose samples move with the silhouettes.
 
 The image is I_p = integral of h(T(u) - p) L(T(u)) det T(u) du, with T the warp of
-:mod:`~gshell_mi.integrators.warp`: the identity at the current parameters, with a derivative that
+``warp``: the identity at the current parameters, with a derivative that
 follows the silhouettes. Inside the integral everything is then continuous and ordinary automatic
 differentiation is right.
 """
+
+from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
 from .camera_samples import CameraSamples, not_lost, numbers_of
-from .edge_table import scene_edge_tables
+from .edge_table import EdgeTable, scene_edge_tables
+from .film_integrator import FilmIntegrator
 from .film_splat import FilmSplat
+from .path_sample import PathSample
 from .pixel_borders import PixelBorders
 from .silhouette_edges import screen_edges
-from .supported_scenes import check_meshes, check_sensor, warn_once
+from .supported_scenes import check_meshes, check_sensor, sensor_of, warn_once
 from .warp import EdgeGrid, FilmWarp, fixed_line_weight
 
 
-def film_channels(film, value, alpha, aovs, wavelengths):
+def film_channels(film: mi.Film, value: mi.Spectrum, alpha: mi.Float, aovs: list[mi.Float],
+                  wavelengths: mi.Color0f) -> list[mi.Float]:
     """The channels that a sample splats, without the weight: colour, alpha if kept, AOVs."""
     value = mi.unpolarized_spectrum(value)
     if mi.is_spectral:
@@ -31,7 +36,7 @@ def film_channels(film, value, alpha, aovs, wavelengths):
     return channels + list(aovs)
 
 
-def _develop(film, channels, aov_names):
+def _develop(film: mi.Film, channels: list[mi.Float], aov_names: list[str]) -> mi.TensorXf:
     """The film's image of given pixel values; linear, so it maps tangents as well as values."""
     film.prepare(aov_names)
     width, height = film.crop_size()
@@ -47,8 +52,9 @@ def _develop(film, channels, aov_names):
     return film.develop()
 
 
-def _develop_adjoint(film, image_adjoint, count, aov_names):
-    """Adjoint of :func:`_develop`: per channel the adjoint of each pixel."""
+def _develop_adjoint(film: mi.Film, image_adjoint: mi.TensorXf, count: int,
+                     aov_names: list[str]) -> list[mi.Float]:
+    """Adjoint of ``_develop``: per channel the adjoint of each pixel."""
     width, height = film.crop_size()
     with dr.resume_grad():
         channels = [dr.zeros(mi.Float, width * height) for _ in range(count)]
@@ -66,21 +72,24 @@ def _develop_adjoint(film, image_adjoint, count, aov_names):
 class Warp:
     """The warp T of the film that follows the silhouettes of a scene's meshes."""
 
-    def __init__(self, scene, tables, sensor, samples, integrator):
+    def __init__(self, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor,
+                 samples: CameraSamples, integrator: FilmIntegrator) -> None:
         self.film, self.radius = sensor.film(), integrator.warp_radius
         margin = self.radius + 2 - samples.origin[0]
         self.edges = screen_edges(scene, tables, sensor, margin, cull=integrator.cull_hidden,
                                   crease_angle=integrator.crease_angle)
-        self.grid = None
+        self.grid: EdgeGrid | None = None
+        if self.edges is None:
+            return
         with dr.resume_grad():
-            moving = self.edges is not None and dr.grad_enabled((self.edges.a, self.edges.b))
+            moving = dr.grad_enabled((self.edges.a, self.edges.b))
         if moving:
             self.grid = EdgeGrid(self.edges.a, self.edges.b, self.radius, samples.origin, samples.size)
 
-    def __call__(self, u):
+    def __call__(self, u: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
         """T(u) and det T(u), attached, for positions in pixels relative to the crop window."""
         u = mi.Point2f(dr.detach(u))
-        if self.grid is None:
+        if self.grid is None or self.edges is None:
             return u, mi.Float(1)
         fixed, grad_fixed = self._fixed_lines(u)
         dr.eval(u, fixed, grad_fixed)
@@ -89,14 +98,14 @@ class Warp:
                                              grad_fixed)
             return u + velocity, 1 + divergence
 
-    def is_near(self, u):
+    def is_near(self, u: mi.Point2f) -> mi.Bool:
         """Whether any edge is close to the pixel that holds ``u``."""
         if self.grid is None:
             return dr.zeros(mi.Bool, dr.width(u))
         first, last = self.grid.list_at(u)
         return first < last
 
-    def _fixed_lines(self, u):
+    def _fixed_lines(self, u: mi.Point2f) -> tuple[mi.Float, mi.Vector2f]:
         """T must keep what the frame cuts off: its lines do not move."""
         if self.film.sample_border() or self.film.rfilter().is_box_filter():
             return mi.Float(0), mi.Vector2f(0)
@@ -104,13 +113,14 @@ class Warp:
         return fixed_line_weight(u, [(k, x) for k in (0, 1) for x in (mi.Float(0), size[k])], self.radius)
 
 
-def _borders(integrator, scene, sensor, warp, seed, spp):
+def _borders(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, warp: Warp, seed: int,
+             spp: int) -> tuple[PixelBorders, list[mi.Float]] | None:
     """For the box filter, samples on pixel borders and their channels; else ``None``."""
     film = sensor.film()
     if not film.rfilter().is_box_filter():
         return None
 
-    def sampler(size):
+    def sampler(size: int) -> mi.Sampler:
         result = mi.load_dict({"type": "independent"})
         result.seed(mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(1))[0], size)
         return result
@@ -125,9 +135,9 @@ def _borders(integrator, scene, sensor, warp, seed, spp):
     return borders, _primal(integrator, scene, sensor, draw, samples)[1]
 
 
-def _prepare(integrator, scene, sensor, seed, spp):
-    if isinstance(sensor, int):
-        sensor = scene.sensors()[sensor]
+def _prepare(integrator: FilmIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, seed: int,
+             spp: int) -> tuple[mi.Sensor, mi.Sampler, int, CameraSamples]:
+    sensor = sensor_of(scene, sensor)
     check_sensor(sensor)
     check_meshes(scene)
     warn_once(scene, integrator.said)
@@ -137,7 +147,8 @@ def _prepare(integrator, scene, sensor, seed, spp):
     return sensor, sampler, spp, samples
 
 
-def _primal(integrator, scene, sensor, sampler, samples):
+def _primal(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler,
+            samples: CameraSamples) -> tuple[PathSample, list[mi.Float]]:
     ray, weight = samples.rays(sensor, samples.u)
     state = integrator.primal(scene, sampler.clone(), ray)
     dr.eval(state)
@@ -145,7 +156,8 @@ def _primal(integrator, scene, sensor, sampler, samples):
     return state, channels
 
 
-def render_backward(integrator, scene, grad_in, sensor, seed, spp):
+def render_backward(integrator: FilmIntegrator, scene: mi.Scene, grad_in: mi.TensorXf,
+                    sensor: int | mi.Sensor, seed: int, spp: int) -> None:
     """Adds the derivative of ``<grad_in, image>`` to the gradients of the scene's parameters."""
     with dr.suspend_grad():
         sensor, sampler, spp, samples = _prepare(integrator, scene, sensor, seed, spp)
@@ -170,7 +182,7 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
             shifted, _ = warp(traced.u)
             ray, weight = traced.rays(sensor, shifted)
 
-            def on_sample(value, alpha, aovs):
+            def on_sample(value: mi.Spectrum, alpha: mi.Float, aovs: list[mi.Float]) -> mi.Float:
                 channels = film_channels(film, value * weight, alpha, aovs, ray.wavelengths)
                 return sum(x * d for x, d in zip(channels, on_values, strict=True))
 
@@ -189,7 +201,9 @@ def render_backward(integrator, scene, grad_in, sensor, seed, spp):
         dr.eval()
 
 
-def _outputs_of_warp(integrator, scene, sensor, warp, samples, values, image_adjoint, seed, spp):
+def _outputs_of_warp(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, warp: Warp,
+                     samples: CameraSamples, values: list[mi.Float], image_adjoint: list[mi.Float], seed: int,
+                     spp: int) -> list[mi.Float]:
     """What the warp does to samples of the given channels, weighted by the image's adjoint."""
     with dr.suspend_grad():
         splat = FilmSplat(sensor.film(), spp, samples.u, values)
@@ -205,7 +219,7 @@ def _outputs_of_warp(integrator, scene, sensor, warp, samples, values, image_adj
     return outputs
 
 
-def _in_place(values, index, count):
+def _in_place(values: list[mi.Float], index: mi.UInt32 | None, count: int) -> list[mi.Float]:
     """Numbers of all samples from those of the traced ones; the others' are 0."""
     if index is None:
         return values
@@ -216,7 +230,7 @@ def _in_place(values, index, count):
     return result
 
 
-def _traverse(outputs, flags):
+def _traverse(outputs: list[mi.Float], flags: dr.ADFlag) -> None:
     """Propagates a derivative of one from each output."""
     for output in outputs:
         dr.set_grad(output, 1)
@@ -224,7 +238,8 @@ def _traverse(outputs, flags):
     dr.traverse(dr.ADMode.Backward, flags)
 
 
-def render_forward(integrator, scene, sensor, seed, spp):
+def render_forward(integrator: FilmIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, seed: int,
+                   spp: int) -> mi.TensorXf:
     """The derivative of the image along the tangents set on the scene's parameters."""
     with dr.suspend_grad():
         sensor, sampler, spp, samples = _prepare(integrator, scene, sensor, seed, spp)
@@ -242,7 +257,7 @@ def render_forward(integrator, scene, sensor, seed, spp):
             shifted, det = warp(traced.u)
             ray, weight = traced.rays(sensor, shifted)
 
-            def on_sample(value, alpha, aovs):
+            def on_sample(value: mi.Spectrum, alpha: mi.Float, aovs: list[mi.Float]) -> list[mi.Float]:
                 return film_channels(film, value * weight, alpha, aovs, ray.wavelengths)
 
             tangents, (shift, divergence, *swept) = integrator.attached(

@@ -1,5 +1,7 @@
 """Systematic sampling of long lists, and low-discrepancy numbers along them."""
 
+from __future__ import annotations
+
 import drjit as dr
 import mitsuba as mi
 
@@ -8,24 +10,20 @@ import mitsuba as mi
 _STEPS = tuple(int(2**32 * 1.0969815577985598**-k) for k in range(1, 8))
 
 
-def low_discrepancy(index, dimension, shifts):
+def low_discrepancy(index: mi.UInt32, dimension: int, shifts: mi.Float) -> mi.Float:
     """Numbers in [0, 1): entry ``index`` of a shifted Kronecker sequence.
 
-    Parameters
-    ----------
-    index:
-        ``UInt32``.
-    dimension:
-        0 to 6.
-    shifts:
-        ``Float``, width 7 or more: uniform random numbers, one per dimension.
+    Args:
+        index: ``UInt32``.
+        dimension: 0 to 6.
+        shifts: ``Float``, width 7 or more: uniform random numbers, one per dimension.
     """
     shift = dr.gather(mi.Float, shifts, mi.UInt32(dimension))
     x = mi.Float((index * mi.UInt32(_STEPS[dimension])) >> 8) * (1 / 2**24) + shift
     return dr.minimum(x - dr.floor(x), dr.one_minus_epsilon(mi.Float))
 
 
-def expand(count):
+def expand(count: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, int]:
     """For counts per item, the item of each of the ``sum(count)`` entries and its number there.
 
     >>> item, number, total = expand(mi.UInt32(0, 2, 1))
@@ -47,22 +45,18 @@ def expand(count):
     return entry, number, total
 
 
-def systematic_counts(importance, samples, offset):
+def systematic_counts(importance: mi.Float, samples: int,
+                      offset: mi.Float) -> tuple[mi.UInt32, mi.Float] | None:
     """How often to draw each item, in proportion to its importance, with one uniform number for all.
 
-    Parameters
-    ----------
-    importance:
-        ``Float``: not negative; infinite and undefined entries count as 0.
-    samples:
-        How many to draw.
-    offset:
-        ``Float``, width 1: uniform in [0, 1).
+    Args:
+        importance: ``Float``: not negative; infinite and undefined entries count as 0.
+        samples: how many to draw.
+        offset: ``Float``, width 1: uniform in [0, 1).
 
-    Returns
-    -------
-    ``UInt32`` counts, and ``Float``: the weight of one draw of each item, which is one over the
-    expected count. ``None`` if nothing has any importance.
+    Returns:
+        ``UInt32`` counts, and ``Float``: the weight of one draw of each item, which is one over the
+        expected count. ``None`` if nothing has any importance.
 
     >>> count, weight = systematic_counts(mi.Float(1, 0, 3), 8, mi.Float(0.5))
     >>> count.numpy().tolist(), [round(w, 4) for w in dr.select(count > 0, weight, 0).numpy().tolist()]

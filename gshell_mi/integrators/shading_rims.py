@@ -6,11 +6,13 @@ and position ``p`` linear in the barycentric coordinates ``b``; it is replaced b
 ends, on the edges of the face, are exact.
 """
 
+from __future__ import annotations
+
 import drjit as dr
 import mitsuba as mi
 
 
-def shading_rims(mesh, viewpoint):
+def shading_rims(mesh: mi.Mesh, viewpoint: mi.Point3f) -> tuple[mi.Point3f, mi.Point3f] | None:
     """End points of the chords in world space, attached to the mesh: two ``Point3f``, or ``None``.
 
     >>> import numpy as np
@@ -44,12 +46,12 @@ def shading_rims(mesh, viewpoint):
         return _crossing(mesh, first, second, viewpoint), _crossing(mesh, first, third, viewpoint)
 
 
-def _vertex(mesh, index):
+def _vertex(mesh: mi.Mesh, index: mi.UInt32) -> tuple[mi.Point3f, mi.Vector3f]:
     return (dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), index),
             mi.Vector3f(dr.gather(mi.Normal3f, mesh.vertex_normals_buffer(), index)))
 
 
-def _crossing(mesh, i, j, viewpoint):
+def _crossing(mesh: mi.Mesh, i: mi.UInt32, j: mi.UInt32, viewpoint: mi.Point3f) -> mi.Point3f:
     """Where on the edge from vertex i to j, of different sides, normal and view are at right angles."""
     (p, n), (q, m) = _vertex(mesh, i), _vertex(mesh, j)
     v, w = viewpoint - p, viewpoint - q

@@ -15,18 +15,26 @@ the rest is thinned out (importance resampling, Talbot et al. 2005) in proportio
 jump times the area on the film that a unit motion of the edge sweeps.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from ..means import channel_mean, mean
-from .edge_wedges import build_edge_wedges
-from .reparameterised_film import film_channels
+from .edge_table import EdgeTable
+from .edge_wedges import EdgeWedges, build_edge_wedges
+from .reparameterised_film import Warp, film_channels
 from .resampling import systematic_counts
-from .shadow_curves import ShadowCurves
-from .shadow_edges import draw_directions, draw_emitters, draw_map_directions
+from .shadow_curves import ShadowCurves, ShadowPoints
+from .shadow_edges import ShadowSamples, draw_directions, draw_emitters, draw_map_directions
 from .silhouette_edges import project_to_film
+
+if TYPE_CHECKING:
+    from .gshell_path import GShellPathIntegrator
 
 #: Points tried per point used
 CANDIDATES = 4
@@ -39,25 +47,26 @@ _INDIRECT = 0.2
 class BoundaryTerm:
     """Points on curves of the film at which the integrand jumps."""
 
-    moving: object      #: ``Point2f``, attached: position in pixels relative to the crop window
-    tangent: object     #: ``Vector2f``: its derivative along the edge
-    weight: object      #: ``Float``
-    jump: object        #: per film channel, the value on the left of the tangent less the other
+    moving: mi.Point2f    #: attached: position in pixels relative to the crop window
+    tangent: mi.Vector2f  #: its derivative along the edge
+    weight: mi.Float
+    jump: list[mi.Float]  #: per film channel, the value on the left of the tangent less the other
 
     @property
-    def film(self):
+    def film(self) -> mi.Point2f:
         """The present position."""
         return dr.detach(self.moving)
 
-    def swept(self, warp):
+    def swept(self, warp: Warp) -> mi.Float:
         """Weighted area that the curve sweeps over the film, relative to the warp; attached."""
         shifted, _ = warp(self.film)
         motion = mi.Vector2f(self.moving - shifted)
         return self.weight * (self.tangent.y * motion.x - self.tangent.x * motion.y)
 
 
-def boundary_terms(integrator, scene, tables, sensor, seed):
-    """Yields the :class:`BoundaryTerm` of each kind of light, and of each depth it is seen at.
+def boundary_terms(integrator: GShellPathIntegrator, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]],
+                   sensor: mi.Sensor, seed: int) -> Iterator[BoundaryTerm]:
+    """Yields the ``BoundaryTerm`` of each kind of light, and of each depth it is seen at.
 
     ``integrator``: a ``gshell_path``; its ``reparam_depth``, ``gradient_depth``, ``light_edge_samples`` and
     ``crease_angle`` are honoured.
@@ -70,7 +79,7 @@ def boundary_terms(integrator, scene, tables, sensor, seed):
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, 8)
 
-    def shifts():
+    def shifts() -> mi.Float:
         x = sampler.next_1d()
         dr.eval(x)
         return x
@@ -93,13 +102,15 @@ def boundary_terms(integrator, scene, tables, sensor, seed):
 class _Boundary:
     """Follows edge points to the film and measures the jump there."""
 
-    def __init__(self, integrator, scene, sensor, wedges):
+    def __init__(self, integrator: GShellPathIntegrator, scene: mi.Scene, sensor: mi.Sensor,
+                 wedges: EdgeWedges) -> None:
         self.integrator, self.scene, self.sensor, self.wedges = integrator, scene, sensor, wedges
         self.curves = ShadowCurves(scene, sensor, wedges)
         film = sensor.film()
         self.border = film.rfilter().border_size() if film.sample_border() else 0
 
-    def term(self, drawn, bounce, samples, sampler):
+    def term(self, drawn: ShadowSamples, bounce: int, samples: int,
+             sampler: mi.Sampler) -> BoundaryTerm | None:
         """The boundary term of drawn edge samples, or ``None`` if none of them is seen."""
         indirect = drawn.emitter is None and not bounce and self.integrator.gradient_depth > 2
         cast, outward, importance = self._importance(drawn, bounce, indirect)
@@ -132,12 +143,13 @@ class _Boundary:
         dr.eval(jump, tangent, drawn.weight)
         return BoundaryTerm(moving, tangent, drawn.weight, jump)
 
-    def _path_sampler(self, sampler, drawn):
+    def _path_sampler(self, sampler: mi.Sampler, drawn: ShadowSamples) -> mi.Sampler:
         result = sampler.clone()
         result.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)), dr.width(drawn.t))
         return result
 
-    def _importance(self, drawn, bounce, indirect):
+    def _importance(self, drawn: ShadowSamples, bounce: int,
+                    indirect: bool) -> tuple[mi.Bool, mi.Vector3f, mi.Float]:
         """Which points are those of cast shadows, the way out of each edge's wedge, and how many to use."""
         cast, outward, valid = self.curves.place(drawn)
         followed = self.curves.follow(dr.detach(self.wedges.positions), drawn, cast, outward, bounce)
@@ -158,7 +170,8 @@ class _Boundary:
         dr.eval(cast, outward, importance, drawn.weight)
         return cast, outward, importance
 
-    def _reflected(self, drawn, cast, followed, bounce):
+    def _reflected(self, drawn: ShadowSamples, cast: mi.Bool, followed: ShadowPoints,
+                   bounce: int) -> tuple[mi.Spectrum, mi.Spectrum, mi.Bool]:
         """What the camera sees per light at the boundary; the emitter's light; whether it is seen at all."""
         film = self.sensor.film()
         visible, tolerance = dr.detach(followed.visible), 1e-3
@@ -182,7 +195,8 @@ class _Boundary:
         scattered = throughput * si.bsdf().eval(context, si, si.to_local(direction), ok)
         return scattered, radiance, ok
 
-    def _light(self, drawn, si, active):
+    def _light(self, drawn: ShadowSamples, si: mi.SurfaceInteraction3f,
+               active: mi.Bool) -> tuple[mi.Vector3f, mi.Spectrum]:
         """Direction and radiance (times the geometry term, for points) of unoccluded light."""
         direction = drawn.towards(si.p)
         if drawn.emitter is None:
@@ -204,7 +218,7 @@ class _Boundary:
             geometry = dr.abs_dot(ds.n, ds.d) / dr.square(ds.dist)
         return direction, drawn.emitter.eval_direction(si, ds, active) * geometry
 
-    def _reaches(self, drawn, ray, lit):
+    def _reaches(self, drawn: ShadowSamples, ray: mi.Ray3f, lit: mi.Point3f) -> mi.Bool:
         """Whether rays meet nothing on their way to the light."""
         ray = mi.Ray3f(ray)
         if drawn.is_point:

@@ -1,11 +1,14 @@
 """The curves on the film along which edges cut off light: from points on edges to what a camera sees."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from .edge_wedges import silhouette_for
+from .edge_wedges import EdgeWedges, silhouette_for
+from .shadow_edges import ShadowSamples
 from .silhouette_edges import project_to_film
 
 #: Share of the points that are tried as the place where a mesh turns away from the light
@@ -24,32 +27,29 @@ _SHARPEST = 1e-2
 class ShadowPoints:
     """Shadows of points on edges, or edge points at which a mesh turns away from the light."""
 
-    visible: object     #: ``Point3f``, attached: what a camera may see
-    lit: object         #: ``Point3f``: where the light arrives
-    y: object           #: ``Point3f``: the point beside the edge
-    along: object       #: ``Vector3f``: derivative of ``visible`` along the edge
-    across: object      #: ``Vector3f``: derivative of ``visible`` for a unit motion towards the light
-    valid: object       #: ``Bool``
-    via: object         #: ``Vector3f``: direction from ``visible`` to ``lit`` if these differ
+    visible: mi.Point3f  #: attached: what a camera may see
+    lit: mi.Point3f      #: where the light arrives
+    y: mi.Point3f        #: the point beside the edge
+    along: mi.Vector3f   #: derivative of ``visible`` along the edge
+    across: mi.Vector3f  #: derivative of ``visible`` for a unit motion towards the light
+    valid: mi.Bool
+    via: mi.Vector3f | None  #: direction from ``visible`` to ``lit`` if these differ
 
 
 class ShadowCurves:
     """Follows points on edges along the light that they cut off.
 
-    Parameters
-    ----------
-    scene, sensor:
-        The scene, and a perspective sensor.
-    wedges:
-        The :class:`~gshell_mi.integrators.edge_wedges.EdgeWedges` of the scene.
+    Args:
+        scene, sensor: the scene, and a perspective sensor.
+        wedges: the ``EdgeWedges`` of the scene.
     """
 
-    def __init__(self, scene, sensor, wedges):
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, wedges: EdgeWedges) -> None:
         self.scene, self.sensor, self.wedges = scene, sensor, wedges
         self.to_camera = dr.detach(sensor.world_transform()).inverse()
         self.viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
 
-    def place(self, drawn):
+    def place(self, drawn: ShadowSamples) -> tuple[mi.Bool, mi.Vector3f, mi.Bool]:
         """Decides for each point whether it is to cast a shadow, and corrects the weights for that.
 
         The other points are those where the visible side of a mesh turns away from the light: shading
@@ -71,7 +71,8 @@ class ShadowCurves:
         valid = dr.isfinite(dr.squared_norm(outward)) & (drawn.weight > 0)
         return cast, mi.Vector3f(outward * (_BESIDE * _scale(y))), valid
 
-    def follow(self, positions, drawn, cast, outward, bounce):
+    def follow(self, positions: mi.Float, drawn: ShadowSamples, cast: mi.Bool, outward: mi.Vector3f,
+               bounce: int) -> ShadowPoints:
         """From points on edges to what a camera may see of their shadow."""
         wedges = self.wedges
         a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, x, drawn.edge))
@@ -98,7 +99,7 @@ class ShadowCurves:
             valid &= hit
         return ShadowPoints(mi.Point3f(p), mi.Point3f(lit), y_now, along, across, valid, via)
 
-    def _lit_side(self, drawn, towards):
+    def _lit_side(self, drawn: ShadowSamples, towards: mi.Vector3f) -> mi.Vector3f:
         """Unit vectors from edges into the face that is turned to the light."""
         _, _, _, inward, across = self.wedges.frame(drawn.edge)
         high = dr.gather(mi.Float, self.wedges.high, drawn.edge)
@@ -106,7 +107,7 @@ class ShadowCurves:
         angle = dr.select(dr.dot(outer, towards) > 0, high, dr.gather(mi.Float, self.wedges.low, drawn.edge))
         return inward * dr.cos(angle) + across * dr.sin(angle)
 
-    def _into(self, edge):
+    def _into(self, edge: mi.UInt32) -> mi.Vector3f:
         """Vectors into the wedges of edges, to points a unit away from both sides."""
         _, _, _, inward, across = self.wedges.frame(edge)
         low, high = (dr.gather(mi.Float, x, edge) for x in (self.wedges.low, self.wedges.high))
@@ -114,7 +115,8 @@ class ShadowCurves:
         length = dr.rcp(dr.maximum(dr.sin(0.5 * (high - low)), _SHARPEST))
         return (inward * dr.cos(middle) + across * dr.sin(middle)) * length
 
-    def _next_surface(self, p, direction, lift, active):
+    def _next_surface(self, p: mi.Point3f, direction: mi.Vector3f, lift: mi.Float | float,
+                      active: mi.Bool) -> tuple[mi.Point3f, mi.Normal3f, mi.Bool]:
         """The next surface from points along a direction: position, attached; normal; whether any."""
         ray = mi.Ray3f(mi.Point3f(p + direction * lift), direction)
         with dr.suspend_grad():
@@ -122,7 +124,7 @@ class ShadowCurves:
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
         return mi.Point3f(si.p), dr.detach(si.n), pi.is_valid() & active
 
-    def film_vectors(self, followed):
+    def film_vectors(self, followed: ShadowPoints) -> tuple[mi.Vector2f, mi.Float, mi.Float]:
         """Derivative of the film position along the edge; the film area that a unit motion across it
         sweeps; and the sign of the side on which there is light."""
         p = mi.Point3f(dr.detach(followed.visible))
@@ -131,7 +133,7 @@ class ShadowCurves:
         area = dr.abs(cross)
         return tangent, dr.select(dr.isfinite(area), area, 0), dr.sign(cross)
 
-    def _on_film(self, p, direction):
+    def _on_film(self, p: mi.Point3f, direction: mi.Vector3f) -> mi.Vector2f:
         """Derivative of the film position of points along a direction."""
         distance, length = dr.norm(p - self.viewpoint), dr.norm(direction)
         step = 1e-2 * distance / dr.maximum(length, 1e-20)
@@ -141,7 +143,8 @@ class ShadowCurves:
         offset = project_to_film(self.sensor, moved) - project_to_film(self.sensor, p)
         return mi.Vector2f(offset) * (scale / step)
 
-    def rays(self, drawn, cast, followed, outward):
+    def rays(self, drawn: ShadowSamples, cast: mi.Bool, followed: ShadowPoints,
+             outward: mi.Vector3f) -> tuple[mi.Ray3f, mi.Ray3f]:
         """Rays towards the light that pass by the edge, and that its wedge stops."""
         lit = mi.Ray3f(followed.y, drawn.towards(followed.y))
         # Straight in from a sharp edge would be out again on the other side.
@@ -154,11 +157,11 @@ class ShadowCurves:
         return lit, mi.Ray3f(mi.Point3f(origin), direction)
 
 
-def _scale(p):
+def _scale(p: mi.Point3f) -> mi.Float:
     """What rounding errors of points are in proportion to."""
     return 1 + dr.max(dr.abs(p))
 
 
-def _slide(vector, normal, along):
+def _slide(vector: mi.Vector3f, normal: mi.Normal3f, along: mi.Vector3f) -> mi.Vector3f:
     """The vector projected along a direction on the plane with the given normal."""
     return vector - along * (dr.dot(normal, vector) / dr.dot(normal, along))

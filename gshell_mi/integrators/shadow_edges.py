@@ -1,18 +1,22 @@
 """Draws points on edges together with light for which the edge is a silhouette.
 
 For the environment each sample has a direction of its own, drawn from the edge's lunes (see
-:mod:`~gshell_mi.integrators.edge_wedges`) with a density proportional to the apparent length of the
+``edge_wedges``) with a density proportional to the apparent length of the
 edge; where an environment map is bright beyond what that density can serve, directions of its own
 density take over. Light from points is drawn first, 32 points per emitter, and edges then in
 proportion to what they cut off.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
 import drjit as dr
 import mitsuba as mi
 
-from .edge_wedges import silhouette_for
+from ..arrays import AnyArray
+from .edge_wedges import EdgeWedges, silhouette_for
 from .resampling import expand, low_discrepancy, systematic_counts
 
 BATCH = 32
@@ -26,32 +30,33 @@ _PEAK = 8.0
 class ShadowSamples:
     """Points on edges and light that the edges may cut off."""
 
-    edge: object            #: ``UInt32``: index into the ``EdgeWedges``
-    t: object               #: ``Float``: where on the edge
-    weight: object          #: ``Float``: one over the expected number of such samples
-    position: object        #: ``Vector3f``: unit direction of the light, or point on an emitter
-    normal: object = None   #: ``Normal3f``: the emitter's there, if it has any
-    uv: object = None       #: ``Point2f``: its texture coordinates there
-    kind: object = None     #: ``Float``: uniform random number
-    via: object = None      #: ``Point2f``: uniform random numbers
-    emitter: object = None  #: the emitter; ``None`` for the environment
-    is_point: bool = False  #: whether ``position`` is a point
+    edge: mi.UInt32                    #: index into the ``EdgeWedges``
+    t: mi.Float                        #: where on the edge
+    weight: mi.Float                   #: one over the expected number of such samples
+    position: mi.Vector3f              #: unit direction of the light, or point on an emitter
+    normal: mi.Normal3f | None         #: the emitter's there, if it has any
+    uv: mi.Point2f | None              #: its texture coordinates there
+    kind: mi.Float                     #: uniform random number
+    via: mi.Point2f                    #: uniform random numbers
+    emitter: mi.Emitter | None = None  #: the emitter; ``None`` for the environment
+    is_point: bool = False             #: whether ``position`` is a point
 
-    def take(self, index):
+    def take(self, index: mi.UInt32) -> ShadowSamples:
         """The samples with the given indices."""
         arrays = [None if x is None else dr.gather(type(x), x, index) for x in self.arrays()]
-        return ShadowSamples(*arrays, self.emitter, self.is_point)
+        return ShadowSamples(*arrays, emitter=self.emitter, is_point=self.is_point)
 
-    def arrays(self):
+    def arrays(self) -> list[AnyArray | None]:
         """What there is one of per sample."""
         return [getattr(self, f.name) for f in fields(self)[:-2]]
 
-    def towards(self, y):
+    def towards(self, y: mi.Point3f) -> mi.Vector3f:
         """Unit direction of the light from points, attached to them."""
         return dr.normalize(mi.Point3f(self.position) - y) if self.is_point else self.position
 
 
-def draw_directions(scene, wedges, samples, shifts):
+def draw_directions(scene: mi.Scene, wedges: EdgeWedges, samples: int,
+                    shifts: mi.Float) -> ShadowSamples | None:
     """Edges by length and width of their lunes, directions from the lunes.
 
     Half of the samples are spread evenly over the meshes, lest the rim of a large floor gets all.
@@ -79,12 +84,12 @@ def draw_directions(scene, wedges, samples, shifts):
     direction = axis * cosine + (inward * dr.cos(angle) + across * dr.sin(angle)) * sine
     weight *= dr.select(sine > 1e-4, dr.pi * opening / sine, 0)
     result = ShadowSamples(edge, u[0], weight * (1 - _map_share(scene, direction)), direction,
-                           kind=u[4], via=mi.Point2f(u[5], u[6]))
+                           None, None, u[4], mi.Point2f(u[5], u[6]))
     dr.eval(result.arrays())
     return result
 
 
-def _map_share(scene, direction):
+def _map_share(scene: mi.Scene, direction: mi.Vector3f) -> mi.Float:
     """Which share of the light from a direction is left to ``draw_map_directions``."""
     if scene.environment() is None:
         return mi.Float(0)
@@ -94,13 +99,14 @@ def _map_share(scene, direction):
     return dr.maximum(1 - _PEAK / (4 * dr.pi * density), 0)
 
 
-def _points(shifts):
+def _points(shifts: mi.Float) -> mi.Point2f:
     """32 points in the unit square, evenly spread."""
     index = dr.arange(mi.UInt32, BATCH)
     return mi.Point2f(low_discrepancy(index, 0, shifts), low_discrepancy(index, 1, shifts))
 
 
-def draw_map_directions(scene, wedges, samples, shifts):
+def draw_map_directions(scene: mi.Scene, wedges: EdgeWedges, samples: int,
+                        shifts: mi.Float) -> ShadowSamples | None:
     """Directions from an environment map's own density, where it is much brighter than elsewhere."""
     environment = scene.environment()
     if environment is None:
@@ -114,7 +120,8 @@ def draw_map_directions(scene, wedges, samples, shifts):
     return _draw_batch(wedges, mi.Vector3f(ds.d), share / (BATCH * ds.pdf), samples, shifts)
 
 
-def draw_emitters(scene, wedges, samples, shifts):
+def draw_emitters(scene: mi.Scene, wedges: EdgeWedges, samples: int,
+                  shifts: mi.Float) -> Iterator[ShadowSamples | None]:
     """For each other light points on it (or its direction), and edges that are silhouettes for them."""
     nowhere = dr.zeros(mi.Interaction3f, BATCH)
     for shape in scene.shapes():
@@ -130,8 +137,9 @@ def draw_emitters(scene, wedges, samples, shifts):
                               shifts, emitter, is_point)
 
 
-def _draw_batch(wedges, position, weight, samples, shifts, emitter=None, is_point=False, normal=None,
-                uv=None):
+def _draw_batch(wedges: EdgeWedges, position: mi.Vector3f, weight: mi.Float, samples: int, shifts: mi.Float,
+                emitter: mi.Emitter | None = None, is_point: bool = False, normal: mi.Normal3f | None = None,
+                uv: mi.Point2f | None = None) -> ShadowSamples | None:
     position, weight = (x + dr.zeros(type(x), BATCH) for x in (position, weight))
     dr.make_opaque(position, weight, normal, uv)
     edge = dr.arange(mi.UInt32, dr.width(wedges.start))
@@ -139,7 +147,7 @@ def _draw_batch(wedges, position, weight, samples, shifts, emitter=None, is_poin
     flat = dr.ravel(position)
     dr.eval(flat)
 
-    def direction(source):
+    def direction(source: mi.UInt32) -> mi.Vector3f:
         z = dr.gather(mi.Vector3f, flat, source)
         return mi.Vector3f(mi.Point3f(z) - 0.5 * (p + q)) if is_point else z
 

@@ -1,11 +1,14 @@
 """The edges of a scene's meshes at which the image is discontinuous for a pinhole camera."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from .edge_table import SIZE_INDEPENDENT, join
+from ..arrays import AnyArray
+from .edge_table import SIZE_INDEPENDENT, EdgeTable, join
 from .resampling import expand
 from .shading_rims import shading_rims
 
@@ -17,11 +20,12 @@ class ScreenEdges:
     Coordinates are pixels relative to the film's crop window, as in ``sensor.sample_direction``.
     """
 
-    a: object       #: ``Point2f``, attached: first end point
-    b: object       #: ``Point2f``, attached: second end point
+    a: mi.Point2f  #: attached: first end point
+    b: mi.Point2f  #: attached: second end point
 
 
-def silhouette_mask(positions, faces, table, viewpoint):
+def silhouette_mask(positions: mi.Float, faces: mi.UInt32, table: EdgeTable,
+                    viewpoint: mi.Point3f) -> mi.Bool:
     """Which directed edges carry the silhouette seen from a point.
 
     An edge carries it when all its faces lie on one side of the plane through the edge and the
@@ -29,7 +33,7 @@ def silhouette_mask(positions, faces, table, viewpoint):
     away. The test does not depend on how the faces are oriented.
 
     Returns a ``Bool`` of width 3F, true at the representative of each such edge of the
-    :class:`~gshell_mi.integrators.edge_table.EdgeTable`.
+    ``EdgeTable``.
 
     >>> from gshell_mi.integrators.edge_table import build_edge_table
     >>> tet = mi.Float(0, 0, 0,  1, 0, 0,  0, 1, 0,  0, 0, 1)
@@ -53,7 +57,7 @@ def silhouette_mask(positions, faces, table, viewpoint):
     return (table.degree > 0) & (dr.abs(sides) == table.degree)
 
 
-def crease_mask(mesh, table, angle):
+def crease_mask(mesh: mi.Mesh, table: EdgeTable, angle: float) -> mi.Bool:
     """Which directed edges carry a jump of the shading although both their faces are seen.
 
     These are edges with a dihedral angle above ``angle`` (degrees) between flat-shaded faces, and
@@ -76,7 +80,7 @@ def crease_mask(mesh, table, angle):
     return table.split & (table.degree == 2) & (sharp | mesh.has_vertex_texcoords())
 
 
-def _clip(lo, hi, inside_a, inside_b):
+def _clip(lo: mi.Float, hi: mi.Float, inside_a: mi.Float, inside_b: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Narrows the interval [lo, hi] of a segment to where the linear function is positive."""
     cut = inside_a / (inside_a - inside_b)
     lo = dr.select((inside_a < 0) & (inside_b >= 0), dr.maximum(lo, cut), lo)
@@ -84,12 +88,14 @@ def _clip(lo, hi, inside_a, inside_b):
     return lo, dr.select((inside_a < 0) & (inside_b < 0), -1, hi)
 
 
-def _compact(selected, *arrays):
+def _compact(selected: mi.Bool, *arrays: AnyArray) -> list[AnyArray]:
     index = dr.compress(selected)
     return [dr.gather(type(x), x, index) for x in arrays]
 
 
-def _mesh_pieces(mesh, table, sensor, crease_angle, margin, piece_length, to_camera, near):
+def _mesh_pieces(mesh: mi.Mesh, table: EdgeTable, sensor: mi.Sensor, crease_angle: float, margin: float,
+                 piece_length: float, to_camera: mi.Transform4f,
+                 near: float) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float] | None:
     """The silhouette of one mesh in pieces: vertices of the edge, and the interval of it they span."""
     positions, faces = dr.detach(mesh.vertex_positions_buffer()), mesh.faces_buffer()
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
@@ -124,7 +130,7 @@ def _mesh_pieces(mesh, table, sensor, crease_angle, margin, piece_length, to_cam
     start, end, s0, s1, t0, t1, zp, zq = (
         dr.gather(type(x), x, edge) for x in (start, end, s0, s1, t0, t1, zp, zq))
 
-    def along(x):
+    def along(x: mi.Float) -> mi.Float:
         t = dr.lerp(t0, t1, x)
         s = t * zp / dr.fma(t, zp, (1 - t) * zq)    # film to edge parameter, perspective-correct
         return dr.lerp(s0, s1, s)
@@ -132,14 +138,14 @@ def _mesh_pieces(mesh, table, sensor, crease_angle, margin, piece_length, to_cam
     return start, end, along(number * step), along((number + 1) * step)
 
 
-def project_to_film(sensor, p):
+def project_to_film(sensor: mi.Sensor, p: mi.Point3f) -> mi.Point2f:
     """Pixel coordinates of world points, relative to the crop window; attached to both arguments."""
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p = p
     return mi.Point2f(sensor.sample_direction(it, mi.Point2f(0.5))[0].uv)
 
 
-def _seen(scene, viewpoint, p, q):
+def _seen(scene: mi.Scene, viewpoint: mi.Point3f, p: mi.Point3f, q: mi.Point3f) -> mi.Bool:
     """Whether anything of a piece can be seen: false only if all of a few test rays are blocked."""
     seen = dr.zeros(mi.Bool, dr.width(p))
     for t in (0.02, 0.5, 0.98):
@@ -151,7 +157,8 @@ def _seen(scene, viewpoint, p, q):
     return seen
 
 
-def _visible_pieces(scene, sensor, mesh, start, end, lo, hi, cull):
+def _visible_pieces(scene: mi.Scene, sensor: mi.Sensor, mesh: mi.Mesh, start: mi.UInt32, end: mi.UInt32,
+                    lo: mi.Float, hi: mi.Float, cull: bool) -> tuple[mi.Point2f, mi.Point2f] | None:
     """Projected pieces of a mesh's edges, attached, without hidden ones; ``None`` if there are none."""
     if cull:
         viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
@@ -169,7 +176,8 @@ def _visible_pieces(scene, sensor, mesh, start, end, lo, hi, cull):
         return project_to_film(sensor, dr.lerp(p, q, lo)), project_to_film(sensor, dr.lerp(p, q, hi))
 
 
-def _visible_rims(scene, sensor, a, b, margin, to_camera, near, cull):
+def _visible_rims(scene: mi.Scene, sensor: mi.Sensor, a: mi.Point3f, b: mi.Point3f, margin: float,
+                  to_camera: mi.Transform4f, near: float, cull: bool) -> tuple[mi.Point2f, ...] | None:
     """The same of chords in world space, which are short enough not to be cut."""
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
     p, q = mi.Point3f(dr.detach(a)), mi.Point3f(dr.detach(b))
@@ -188,27 +196,21 @@ def _visible_rims(scene, sensor, a, b, margin, to_camera, near, cull):
                      for points in (a, b))
 
 
-def screen_edges(scene, tables, sensor, margin, *, piece_length=4.0, cull=True, crease_angle=0.1):
+def screen_edges(scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor, margin: float,
+                 *, piece_length: float = 4.0, cull: bool = True,
+                 crease_angle: float = 0.1) -> ScreenEdges | None:
     """All silhouettes and shading rims of the scene's meshes, projected and cut into short pieces.
 
-    Parameters
-    ----------
-    scene, sensor:
-        The scene, and a perspective sensor.
-    tables:
-        What :func:`~gshell_mi.integrators.edge_table.scene_edge_tables` gives for the scene.
-    margin:
-        Width in pixels of the band around the crop window from which edges are kept.
-    piece_length:
-        Greatest length of a piece in pixels.
-    cull:
-        Leave out pieces that other surfaces hide.
-    crease_angle:
-        Dihedral angle in degrees from which an edge between flat-shaded faces counts.
+    Args:
+        scene, sensor: the scene, and a perspective sensor.
+        tables: what ``scene_edge_tables`` gives for the scene.
+        margin: width in pixels of the band around the crop window from which edges are kept.
+        piece_length: greatest length of a piece in pixels.
+        cull: leave out pieces that other surfaces hide.
+        crease_angle: dihedral angle in degrees from which an edge between flat-shaded faces counts.
 
-    Returns
-    -------
-    ``ScreenEdges``, or ``None`` if there are none.
+    Returns:
+        ``ScreenEdges``, or ``None`` if there are none.
     """
     to_camera = dr.detach(sensor.world_transform()).inverse()
     near = max(sensor.near_clip(), 1e-6)

@@ -1,5 +1,7 @@
 """What a scene contains, and which parts of it the integrators cannot differentiate correctly."""
 
+from __future__ import annotations
+
 import warnings
 
 import mitsuba as mi
@@ -7,18 +9,23 @@ import mitsuba as mi
 from ..errors import UserError
 
 
-def has_surface_emitters(scene):
+def has_surface_emitters(scene: mi.Scene) -> bool:
     """Whether the scene has any area light."""
     return any(mi.has_flag(e.flags(), mi.EmitterFlags.Surface) for e in scene.emitters())
 
 
-def has_bsdf_flag(scene, flag):
+def has_bsdf_flag(scene: mi.Scene, flag: mi.BSDFFlags) -> bool:
     """Whether any surface has a BSDF with the given ``BSDFFlags``."""
     return any(shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), flag)
                for shape in scene.shapes())
 
 
-def check_sensor(sensor):
+def sensor_of(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
+    """A sensor, which may be given by its number in the scene."""
+    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+
+
+def check_sensor(sensor: mi.Sensor) -> None:
     """Raises for sensors whose silhouettes are not those of one viewpoint, and for special films."""
     if sensor.class_name() != "PerspectiveCamera":
         raise UserError(f"Sensor '{sensor.id()}' is a {sensor.class_name()}: gshell_path and gshell_mask "
@@ -29,7 +36,7 @@ def check_sensor(sensor):
                         "and gshell_mask cannot differentiate; use 'hdrfilm'.")
 
 
-def check_meshes(scene):
+def check_meshes(scene: mi.Scene) -> None:
     """Raises for meshes without faces, from whose empty buffers Mitsuba cannot read."""
     for shape in scene.shapes():
         if shape.is_mesh() and shape.face_count() == 0:
@@ -37,7 +44,7 @@ def check_meshes(scene):
                             "give it a face whose three corners are the same.")
 
 
-def unsupported(scene):
+def unsupported(scene: mi.Scene) -> list[str]:
     """Sentences about what the derivatives of this scene leave out.
 
     >>> scene = mi.load_dict({'type': 'scene', 'ball': {'type': 'sphere', 'id': 'ball'}})
@@ -60,8 +67,8 @@ def unsupported(scene):
     return sentences
 
 
-def warn_once(scene, said):
-    """Warns of everything in :func:`unsupported` that is not in the set ``said``, and adds it there."""
+def warn_once(scene: mi.Scene, said: set[str]) -> None:
+    """Warns of everything in ``unsupported`` that is not in the set ``said``, and adds it there."""
     for sentence in unsupported(scene):
         if sentence not in said:
             said.add(sentence)

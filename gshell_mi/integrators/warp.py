@@ -11,6 +11,8 @@ here with a deterministic weight over an explicit list of edges). Its divergence
 form, so no auxiliary rays are needed.
 """
 
+from __future__ import annotations
+
 import drjit as dr
 import mitsuba as mi
 
@@ -20,17 +22,14 @@ from .edge_table import SIZE_INDEPENDENT
 class EdgeGrid:
     """For each pixel of a rectangle the edge pieces within ``radius`` of it.
 
-    Parameters
-    ----------
-    a, b:
-        ``Point2f``: end points in pixels.
-    radius:
-        Reach of the warp in pixels.
-    origin, size:
-        Integer corner and extent of the rectangle in pixels.
+    Args:
+        a, b: ``Point2f``: end points in pixels.
+        radius: reach of the warp in pixels.
+        origin, size: integer corner and extent of the rectangle in pixels.
     """
 
-    def __init__(self, a, b, radius, origin, size):
+    def __init__(self, a: mi.Point2f, b: mi.Point2f, radius: float, origin: tuple[int, int],
+                 size: tuple[int, int]) -> None:
         self.radius = dr.opaque(mi.Float, radius)
         self.origin = mi.Point2i(dr.opaque(mi.Int32, origin[0]), dr.opaque(mi.Int32, origin[1]))
         self.size = mi.Point2i(dr.opaque(mi.Int32, size[0]), dr.opaque(mi.Int32, size[1]))
@@ -56,7 +55,8 @@ class EdgeGrid:
         dr.eval(self.pieces)
 
     @dr.syntax
-    def _visit_cells(self, a, b, counter, pieces, index):
+    def _visit_cells(self, a: mi.Point2f, b: mi.Point2f, counter: mi.UInt32, pieces: mi.UInt32 | None,
+                     index: mi.UInt32 | None) -> None:
         reach = self.radius + 0.7072    # half the diagonal of a pixel
         low = mi.Point2i(dr.floor(dr.minimum(a, b) - self.radius)) - self.origin
         high = mi.Point2i(dr.floor(dr.maximum(a, b) + self.radius)) - self.origin
@@ -76,7 +76,7 @@ class EdgeGrid:
             x = dr.select(x > high.x, low.x, x)
             active &= y <= high.y
 
-    def list_at(self, u):
+    def list_at(self, u: mi.Point2f) -> tuple[mi.UInt32, mi.UInt32]:
         """First and one-past-last position in ``pieces`` for the pixel that holds ``u``."""
         cell = mi.Point2i(dr.floor(u)) - self.origin
         inside = dr.all((cell >= 0) & (cell < self.size))
@@ -84,7 +84,7 @@ class EdgeGrid:
         return dr.gather(mi.UInt32, self.first, index, inside), dr.gather(mi.UInt32, self.last, index, inside)
 
 
-def nearest_on_segment(u, a, b):
+def nearest_on_segment(u: mi.Point2f, a: mi.Point2f, b: mi.Point2f) -> tuple[mi.Float, mi.Float, mi.Vector2f]:
     """Parameter, distance and (unnormalised) offset of the point of the segment nearest to ``u``."""
     e = b - a
     t = dr.clip(dr.dot(u - a, e) / dr.maximum(dr.squared_norm(e), 1e-20), 0, 1)
@@ -92,7 +92,8 @@ def nearest_on_segment(u, a, b):
     return t, dr.norm(offset), offset
 
 
-def _weight(grid, u, piece, active):
+def _weight(grid: EdgeGrid, u: mi.Point2f, piece: mi.UInt32,
+            active: mi.Bool) -> tuple[mi.Float, mi.Vector2f, mi.Float, mi.Vector2f]:
     """Weight, its gradient, segment parameter and its gradient for one piece."""
     ends = dr.gather(mi.Vector4f, grid.ends, piece, active)
     a, b = mi.Point2f(ends.x, ends.y), mi.Point2f(ends.z, ends.w)
@@ -109,18 +110,19 @@ def _weight(grid, u, piece, active):
 class FilmWarp(dr.CustomOp):
     """Value zero; derivative: velocity ``V`` (``Vector2f``) and divergence (``Float``) of the warp.
 
-    Inputs: end points ``a``, ``b`` (attached), the :class:`EdgeGrid`, sample positions ``u``, and the
+    Inputs: end points ``a``, ``b`` (attached), the ``EdgeGrid``, sample positions ``u``, and the
     weight of immovable lines (``Float``) and its gradient (``Vector2f``) at each sample, or zeros.
     """
 
-    def eval(self, a, b, grid, u, fixed, grad_fixed):
+    def eval(self, a: mi.Point2f, b: mi.Point2f, grid: EdgeGrid, u: mi.Point2f, fixed: mi.Float,
+             grad_fixed: mi.Vector2f) -> tuple[mi.Vector2f, mi.Float]:
         self.grid, self.u, self.count = grid, u, dr.width(a)
         self.fixed, self.grad_fixed = fixed, grad_fixed
         n = dr.width(u)
         return dr.zeros(mi.Vector2f, n), dr.zeros(mi.Float, n)
 
     @dr.syntax
-    def _normaliser(self, tangents):
+    def _normaliser(self, tangents: mi.Float | None) -> tuple[mi.Float, mi.Vector2f, mi.Vector2f, mi.Float]:
         """Sums over the pieces near each sample; the last two only if tangents are given."""
         grid, u = self.grid, self.u
         k, last = grid.list_at(u)
@@ -140,7 +142,7 @@ class FilmWarp(dr.CustomOp):
             k += 1
         return total, grad_total, moved, spread
 
-    def forward(self):
+    def forward(self) -> None:
         va, vb = self.grad_in("a"), self.grad_in("b")
         tangents = dr.zeros(mi.Float, 4 * self.count)
         index = 4 * dr.arange(mi.UInt32, self.count)
@@ -152,7 +154,7 @@ class FilmWarp(dr.CustomOp):
                            spread / total - dr.dot(moved, grad_total) / dr.square(total)))
 
     @dr.syntax
-    def backward(self):
+    def backward(self) -> None:
         velocity, divergence = self.grad_out()
         grid, u = self.grid, self.u
         total, grad_total, _, _ = self._normaliser(None)
@@ -175,11 +177,12 @@ class FilmWarp(dr.CustomOp):
         self.set_grad_in("a", mi.Point2f(ax, ay))
         self.set_grad_in("b", mi.Point2f(bx, by))
 
-    def name(self):
+    def name(self) -> str:
         return "film warp"
 
 
-def fixed_line_weight(u, lines, radius):
+def fixed_line_weight(u: mi.Point2f, lines: list[tuple[int, mi.Float]],
+                      radius: float) -> tuple[mi.Float, mi.Vector2f]:
     """Weight and gradient for axis-aligned lines that must not move (frame, pixel borders).
 
     ``lines``: list of ``(axis, coordinate)``, the coordinate a ``Float``.

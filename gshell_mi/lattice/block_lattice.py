@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
 
 import drjit as dr
 
+from ..arrays import Array3f, Bool, Field, Float, UInt32
 from ..errors import UserError
 from .lattice import MISSING, Lattice
 from .sign_scan import active_cells, closed_signs, sign_changes
@@ -54,7 +54,7 @@ class BlockLattice:
     (True, 0.14)
     """
 
-    def __init__(self, lattice: Lattice, blocks: Any, sdf: Callable[[BlockLattice], Any]):
+    def __init__(self, lattice: Lattice, blocks: UInt32, sdf: Callable[[BlockLattice], Float]):
         uint_t = type(blocks)
         if dr.width(blocks) == 0:
             blocks = dr.zeros(uint_t, 1)  # so that no array is empty
@@ -68,24 +68,24 @@ class BlockLattice:
         y, z = rest % self._stride, rest // self._stride
         self._first = column * 32 + self._stride * rest  # the lattice vertex at the start of each row
         left = self._stride - column * 32
-        self.exists: Any = dr.select(left >= 32, uint_t(MISSING), (uint_t(1) << (left & 31)) - 1)
+        self.exists: UInt32 = dr.select(left >= 32, uint_t(MISSING), (uint_t(1) << (left & 31)) - 1)
         """Per row, bit i: its vertex i lies in the lattice."""
         dr.eval(column, y, z, self._first, self.exists)
 
         rows = _Table(self._key, (across, self._stride, self._stride), _row_count(lattice))
         lane = dr.arange(uint_t, 8 * dr.width(self._key))
         at = [dr.gather(uint_t, c, lane >> 3) + (lane >> i & 1) for i, c in enumerate((column, y, z))]
-        self.upper: Any = rows.find(*at)[0]
+        self.upper: UInt32 = rows.find(*at)[0]
         """Eight per row: itself and the seven rows above it, numbered like the corners of a cell."""
         lane = dr.arange(uint_t, 3 * dr.width(self._key))
         row = lane // 3
         at = [dr.gather(uint_t, c, row) - dr.select(lane - 3 * row == i, uint_t(1), 0)
               for i, c in enumerate((column, y, z))]
-        self.lower: Any = rows.find(*at)[0]
+        self.lower: UInt32 = rows.find(*at)[0]
         """Three per row: the rows before it along x, y and z."""
         before, here, after = rows.surrounded(column, y, z)
         edge = dr.select(here, uint_t(0), MISSING) | dr.select(before, uint_t(0), 1)
-        self.edge: Any = (edge | dr.select(after, uint_t(0), 1 << 31)) & self.exists
+        self.edge: UInt32 = (edge | dr.select(after, uint_t(0), 1 << 31)) & self.exists
         """Per row, bit i: the lattice has a vertex next to its vertex i that is not stored."""
         dr.eval(self.upper, self.lower, self.edge)
 
@@ -94,17 +94,18 @@ class BlockLattice:
         self._lacking = dr.select(here, uint_t(0), 1)
         self._lacking |= dr.select(before, uint_t(0), 2) | dr.select(after, uint_t(0), 4)
         dr.eval(self._lacking)
-        sdf = dr.detach(sdf(self))
-        self.beyond: Any = pack_signs(sdf) & self.edge
+        values = dr.detach(sdf(self))
+        self.beyond: UInt32 = pack_signs(values) & self.edge
         """Per row, bit i: it is the inside that lies beyond the edge vertex i."""
         dr.eval(self.beyond)
-        cells, _ = self.active_cells(sdf)
+        cells, _ = self.active_cells(values)
         if dr.width(cells) and dr.any(is_set(self.edge, cells))[0]:
             raise UserError("the surface of sdf runs out of the blocks; BlockLattice.around finds those that "
                             "it needs")
 
     @classmethod
-    def around(cls, lattice: Lattice, sdf: Any, float_t: type | None = None) -> BlockLattice:
+    def around(cls, lattice: Lattice, sdf: Float | Callable[[Array3f], Float],
+               float_t: type[Float] | None = None) -> BlockLattice:
         """The blocks around a surface, found by a scan of the whole lattice.
 
         Args:
@@ -116,12 +117,13 @@ class BlockLattice:
             raise UserError(f"the grid '{lattice.grid}' cannot be stored in blocks; choose another or leave "
                             f"out the band")
         if not callable(sdf):
-            sdf = dr.detach(sdf.array if dr.is_tensor_v(sdf) else sdf)
-            if dr.width(sdf) != lattice.vertex_count:
-                raise UserError(f"sdf has {dr.width(sdf)} values, but the lattice needs "
+            field = dr.detach(sdf.array if dr.is_tensor_v(sdf) else sdf)
+            if dr.width(field) != lattice.vertex_count:
+                raise UserError(f"sdf has {dr.width(field)} values, but the lattice needs "
                                 f"{lattice.vertex_count}")
-            cells, _ = active_cells(sdf, lattice)
-            return cls(lattice, _blocks_near(lattice, cells), lambda blocks: blocks.take(sdf))
+            cells, _ = active_cells(field, lattice)
+            return cls(lattice, _blocks_near(lattice, cells), lambda blocks: blocks.take(field))
+        assert float_t is not None, "a function needs a type of numbers to compute with"
         uint_t = dr.uint32_array_t(float_t)
         inside = dr.empty(uint_t, -(-lattice.vertex_count // 32))
         last = dr.opaque(uint_t, lattice.vertex_count - 1)
@@ -167,14 +169,14 @@ class BlockLattice:
         """With FlexiCubes 21 per stored vertex, for the cube above it."""
         return 21 * self.vertex_count if self.lattice.weight_count else 0
 
-    def points(self, float_t: type) -> Any:
+    def points(self, float_t: type[Float]) -> Array3f:
         """Positions of the stored vertices without offsets, ``Array3f``."""
         return self.positions_of(dr.arange(self._uint_t, self.vertex_count), float_t)
 
-    def positions_of(self, vertex: Any, float_t: type) -> Any:
+    def positions_of(self, vertex: UInt32, float_t: type[Float]) -> Array3f:
         return self.lattice.positions_of(self.lattice_vertex(vertex), float_t)
 
-    def offset_positions(self, vertex: Any, deform: Any, float_t: type) -> Any:
+    def offset_positions(self, vertex: UInt32, deform: Field | None, float_t: type[Float]) -> Array3f:
         return self.lattice.offset(self.positions_of(vertex, float_t), deform, vertex)
 
     # The stored vertices ------------------------------------------------------------------------------
@@ -184,21 +186,21 @@ class BlockLattice:
         """Share of the lattice's blocks that are stored."""
         return dr.width(self.blocks) / block_count(self.lattice)
 
-    def lattice_vertex(self, vertex: Any) -> Any:
+    def lattice_vertex(self, vertex: UInt32) -> UInt32:
         """Ids in the whole lattice; arbitrary for what fills up rows."""
         return dr.gather(self._uint_t, self._first, vertex >> 5) + (vertex & 31)
 
-    def in_lattice(self, vertex: Any) -> Any:
+    def in_lattice(self, vertex: UInt32) -> Bool:
         """Whether vertices are such, and do not only fill up a row."""
         return is_set(self.exists, vertex)
 
-    def corner(self, vertex: Any, corner: Any) -> Any:
+    def corner(self, vertex: UInt32, corner: UInt32) -> UInt32:
         """The vertex at a corner (bits 0, 1, 2: x, y, z) of the cell above ``vertex``, or ``MISSING``."""
         along = (vertex & 31) + (corner & 1)
         row = dr.gather(self._uint_t, self.upper, vertex >> 5 << 3 | corner & 6 | along >> 5)
         return dr.select(row == MISSING, MISSING, row << 5 | along & 31)
 
-    def neighbour(self, vertex: Any, axis: Any, up: Any) -> Any:
+    def neighbour(self, vertex: UInt32, axis: UInt32, up: Bool) -> UInt32:
         """The next vertex up or down an axis (0, 1, 2), or ``MISSING``."""
         along = vertex & 31
         row = vertex >> 5
@@ -211,18 +213,18 @@ class BlockLattice:
         missing = (row == MISSING) | (within & up & ~exists)
         return dr.select(missing, MISSING, row << 5 | along)
 
-    def neighbours(self, vertex: Any) -> list[Any]:
+    def neighbours(self, vertex: UInt32) -> list[UInt32]:
         """Ids of the nearest stored vertices, as of a lattice: the vertex itself where there is none."""
         mask_t = dr.mask_t(self._uint_t)
         found = (self.neighbour(vertex, self._uint_t(axis), mask_t(up))
                  for axis in range(3) for up in (False, True))
         return [dr.select(neighbour == MISSING, vertex, neighbour) for neighbour in found]
 
-    def signs(self, sdf: Any) -> Any:
+    def signs(self, sdf: Float) -> UInt32:
         """Per row, bit i: its vertex i is inside. Those at the edge are what they were."""
         return (pack_signs(sdf) & ~self.edge) | self.beyond
 
-    def active_cells(self, sdf: Any) -> tuple[Any, Any]:
+    def active_cells(self, sdf: Float) -> tuple[UInt32, UInt32]:
         """Cells whose corners have different signs, as ``sign_scan.active_cells`` of a whole lattice. What is
         not stored has the sign of the edge."""
         inside = self.signs(sdf)
@@ -246,7 +248,7 @@ class BlockLattice:
         return set_bits(active), inside
 
     @cached_property
-    def border(self) -> Any:
+    def border(self) -> UInt32:
         """Per row, bit i: its vertex i lies on the border of the whole lattice."""
         last = self._stride - 1
         rest = self._first // self._stride
@@ -257,7 +259,7 @@ class BlockLattice:
         dr.eval(word)
         return word
 
-    def take(self, field: Any) -> Any:
+    def take(self, field: Float) -> Float:
         """The values at the stored vertices of a field on the whole lattice, flat with any channels."""
         channels = dr.width(field) // self.lattice.vertex_count
         index = dr.arange(self._uint_t, channels * self.vertex_count)
@@ -268,7 +270,7 @@ class BlockLattice:
 
     # Following a surface ------------------------------------------------------------------------------
 
-    def covers(self, cells: Any) -> bool:
+    def covers(self, cells: UInt32) -> bool:
         """Whether all blocks within ``MARGIN`` of the cells, given by their lowest vertices, are stored."""
         if dr.width(cells) == 0:
             return True
@@ -277,7 +279,7 @@ class BlockLattice:
         needed |= dr.select(along + MARGIN + 1 >= 32, self._uint_t(4), 0)
         return not dr.any(dr.gather(self._uint_t, self._lacking, cells >> 5) & needed != 0)[0]
 
-    def around_cells(self, cells: Any, sdf: Callable[[BlockLattice], Any], *,
+    def around_cells(self, cells: UInt32, sdf: Callable[[BlockLattice], Float], *,
                      keep: bool = False) -> BlockLattice:
         """The blocks around cells of this one.
 
@@ -289,7 +291,7 @@ class BlockLattice:
         blocks = _blocks_near(self.lattice, self.lattice_vertex(cells), self.blocks if keep else None)
         return BlockLattice(self.lattice, blocks, sdf)
 
-    def find_in(self, other: BlockLattice) -> Any:
+    def find_in(self, other: BlockLattice) -> UInt32:
         """Per stored vertex the same one of another ``BlockLattice`` of this lattice, or ``MISSING``."""
         sizes = (dr.opaque(self._uint_t, _block_counts(self.lattice)[0]), self._stride, self._stride)
         row = _Table(other._key, sizes, _row_count(self.lattice)).values_at(self._key)
@@ -301,7 +303,7 @@ class BlockLattice:
 class _Table:
     """From coordinates to the rank of what is stored there; a dense array, but of rows or blocks only."""
 
-    def __init__(self, keys: Any, sizes: tuple, count: int):
+    def __init__(self, keys: UInt32, sizes: tuple[UInt32, UInt32, UInt32], count: int):
         self._uint_t = type(keys)
         self._sizes = sizes
         self._rank = dr.full(self._uint_t, MISSING, count)
@@ -309,17 +311,17 @@ class _Table:
         dr.scatter(self._rank, rank, keys, mode=dr.ReduceMode.Permute)
         dr.eval(self._rank)
 
-    def values_at(self, keys: Any) -> Any:
+    def values_at(self, keys: UInt32) -> UInt32:
         return dr.gather(self._uint_t, self._rank, keys)
 
-    def find(self, x: Any, y: Any, z: Any) -> tuple[Any, Any]:
+    def find(self, x: UInt32, y: UInt32, z: UInt32) -> tuple[UInt32, Bool]:
         """The rank at the coordinates, or ``MISSING``, and whether they lie in the lattice."""
         nx, ny, nz = self._sizes
         within = (x < nx) & (y < ny) & (z < nz)  # one before 0 is a huge number
         rank = dr.gather(self._uint_t, self._rank, x + nx * (y + ny * z), within)
         return dr.select(within, rank, MISSING), within
 
-    def surrounded(self, x: Any, y: Any, z: Any) -> list:
+    def surrounded(self, x: UInt32, y: UInt32, z: UInt32) -> list[Bool]:
         """Whether the nine at x - 1, at x and at x + 1 are stored or outside of the lattice."""
         result = []
         for dx in (-1, 0, 1):
@@ -334,7 +336,8 @@ class _Table:
 
 
 def _block_counts(lattice: Lattice) -> tuple[int, int, int]:
-    return tuple(-(-lattice.stride // side) for side in BLOCK)
+    nx, ny, nz = (-(-lattice.stride // side) for side in BLOCK)
+    return nx, ny, nz
 
 
 def block_count(lattice: Lattice) -> int:
@@ -347,7 +350,7 @@ def _row_count(lattice: Lattice) -> int:
     return _block_counts(lattice)[0] * lattice.stride**2
 
 
-def _row_keys(lattice: Lattice, blocks: Any) -> Any:
+def _row_keys(lattice: Lattice, blocks: UInt32) -> UInt32:
     """Numbers ``column + nx (y + stride z)`` of the rows of blocks, ascending."""
     uint_t = type(blocks)
     nx, ny, _ = (dr.opaque(uint_t, count) for count in _block_counts(lattice))
@@ -362,7 +365,7 @@ def _row_keys(lattice: Lattice, blocks: Any) -> Any:
     return dr.compress(stored == 1)
 
 
-def _blocks_near(lattice: Lattice, cells: Any, others: Any = None) -> Any:
+def _blocks_near(lattice: Lattice, cells: UInt32, others: UInt32 | None = None) -> UInt32:
     """Ids of the blocks within ``MARGIN`` of cells, and of the ``others``."""
     uint_t = type(cells)
     counts = _block_counts(lattice)

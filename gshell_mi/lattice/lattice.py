@@ -2,11 +2,12 @@
 
 import importlib
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import drjit as dr
 import numpy as np
 
+from ..arrays import AnyArray, Array3f, Field, Float, UInt32
 from ..errors import UserError
 
 #: Stands for a vertex that does not exist.
@@ -89,7 +90,7 @@ class Lattice:
 
     resolution: int
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not 1 <= self.resolution <= 800:
             raise UserError(
                 f"lattice resolution must be between 1 and 800 cells per side, not {self.resolution}"
@@ -111,7 +112,7 @@ class Lattice:
         are their sums."""
         return self.spacing * np.eye(3)
 
-    def corner(self, vertex: Any, corner: Any) -> Any:
+    def corner(self, vertex: UInt32, corner: UInt32) -> UInt32:
         """The vertex at a corner (bits 0, 1, 2: steps along ``cell_vectors``) of the cell above ``vertex``,
         which must have all its corners."""
         return vertex + corner_offset(corner, dr.opaque(type(vertex), self.stride))
@@ -146,7 +147,7 @@ class Lattice:
             np.moveaxis(ends, axis, 0)[[0, -1]] = True
         return ends.ravel()
 
-    def neighbours(self, vertex: Any) -> list[Any]:
+    def neighbours(self, vertex: UInt32) -> list[UInt32]:
         """Ids of the nearest vertices of each ``vertex``, one array per direction; the vertex itself where
         there is none."""
         x, y, z = self.coordinates(vertex)
@@ -157,14 +158,14 @@ class Lattice:
             found.append(dr.select(coordinate + 1 < stride, vertex + step, vertex))
         return found
 
-    def coordinates(self, vertex: Any) -> tuple[Any, Any, Any]:
+    def coordinates(self, vertex: UInt32) -> tuple[UInt32, UInt32, UInt32]:
         """Number of each vertex in its row, column and layer."""
         stride = dr.opaque(type(vertex), self.stride)
         row = vertex // stride
         z = row // stride
         return vertex - row * stride, row - z * stride, z
 
-    def points(self, float_t: type) -> Any:
+    def points(self, float_t: type[Float]) -> Array3f:
         """The same positions as a Dr.Jit ``Array3f``, for fields evaluated on the device.
 
         Args:
@@ -177,17 +178,17 @@ class Lattice:
         """
         return self.positions_of(dr.arange(dr.uint32_array_t(float_t), self.vertex_count), float_t)
 
-    def positions_of(self, vertex: Any, float_t: type) -> Any:
+    def positions_of(self, vertex: UInt32, float_t: type[Float]) -> Array3f:
         """Positions of the vertices with the ids ``vertex``, without offsets, as ``Array3f``."""
         cell = dr.opaque(float_t, self.spacing)
         array3f_t = array_type(float_t, "Array3f")
         return array3f_t(*(dr.fma(float_t(number), cell, -1) for number in self.coordinates(vertex)))
 
-    def offset_positions(self, vertex: Any, deform: Any, float_t: type) -> Any:
+    def offset_positions(self, vertex: UInt32, deform: Field | None, float_t: type[Float]) -> Array3f:
         """Positions of the vertices with the ids ``vertex``, offset by ``deform`` unless that is None."""
         return self.offset(self.positions_of(vertex, float_t), deform, vertex)
 
-    def offset(self, p: Any, deform: Any, index: Any) -> Any:
+    def offset(self, p: Array3f, deform: Field | None, index: UInt32) -> Array3f:
         """Positions p moved by the offsets at ``index`` of ``deform``, unless that is None."""
         if deform is None:
             return p
@@ -269,7 +270,7 @@ class BccLattice(Lattice):
     def max_offset(self) -> float:
         return MAX_OFFSET_CELLS_BCC * self.spacing
 
-    def neighbours(self, vertex: Any) -> list[Any]:
+    def neighbours(self, vertex: UInt32) -> list[UInt32]:
         uint_t, stride = type(vertex), dr.opaque(type(vertex), self.stride)
         second = vertex >= stride * stride * stride
         # Along an axis the neighbours in the other grid have this one's number and the one below or above.
@@ -287,7 +288,7 @@ class BccLattice(Lattice):
     def cell_vectors(self) -> np.ndarray:
         return self.spacing / 2 * np.array(self.BASIS, float)
 
-    def corner(self, vertex: Any, corner: Any) -> Any:
+    def corner(self, vertex: UInt32, corner: UInt32) -> UInt32:
         """The vertex at a corner of the squeezed cell above ``vertex``; ``MISSING`` where there is none."""
         uint_t, stride = type(vertex), dr.opaque(type(vertex), self.stride)
         count = stride * stride * stride
@@ -312,17 +313,17 @@ class BccLattice(Lattice):
         offset = sum(step * self.stride**axis for axis, step in enumerate(steps))
         return offset + (total & 1) * (-1 if second else 1) * self.stride**3
 
-    def coordinates(self, vertex: Any) -> tuple[Any, Any, Any]:
+    def coordinates(self, vertex: UInt32) -> tuple[UInt32, UInt32, UInt32]:
         count = dr.opaque(type(vertex), self.stride**3)
         return super().coordinates(vertex - dr.select(vertex >= count, count, 0))
 
-    def positions_of(self, vertex: Any, float_t: type) -> Any:
+    def positions_of(self, vertex: UInt32, float_t: type[Float]) -> Array3f:
         half = dr.opaque(float_t, self.spacing / 2)
         second = vertex >= dr.opaque(type(vertex), self.stride**3)
         return super().positions_of(vertex, float_t) + dr.select(second, half, 0)
 
 
-def corner_offset(corner: Any, stride: Any) -> Any:
+def corner_offset(corner: UInt32, stride: UInt32) -> UInt32:
     """Difference between the ids of a cubic cell's corner (bits 0, 1, 2: x, y, z) and its lowest vertex."""
     return (corner & 1) + (corner >> 1 & 1) * stride + (corner >> 2) * (stride * stride)
 
@@ -366,7 +367,7 @@ def lattice_of(grid: str, vertex_count: int) -> Lattice:
     return make_lattice(grid, resolution)
 
 
-def array_type(float_t: type, name: str) -> type:
+def array_type(float_t: type[AnyArray], name: str) -> type[AnyArray]:
     """The Dr.Jit type ``name`` (``"Array3f"``, ``"Array3u"``) of the backend that ``float_t`` belongs to.
 
     >>> import drjit.llvm.ad as d

@@ -1,14 +1,14 @@
 """One pass over the signs of a whole lattice: the cells in which they change, and what is near."""
 
-from typing import Any
 
 import drjit as dr
 
+from ..arrays import Float, UInt32
 from .lattice import MISSING, BccLattice, Lattice, corner_offset
 from .sign_words import pack_signs, set_bits
 
 
-def active_cells(s: Any, lattice: Lattice) -> tuple[Any, Any]:
+def active_cells(s: Float, lattice: Lattice) -> tuple[UInt32, UInt32]:
     """Cells whose corners have different signs, by their lowest vertex, and few others.
 
     The field is read once and packed into one bit per vertex; a neighbour is then a shift in the stream of
@@ -22,7 +22,7 @@ def active_cells(s: Any, lattice: Lattice) -> tuple[Any, Any]:
     return sign_changes(inside, lattice), inside
 
 
-def closed_signs(inside: Any, lattice: Lattice) -> Any:
+def closed_signs(inside: UInt32, lattice: Lattice) -> UInt32:
     """The words of signs, where the lattice closes at its border without the bits there; changes them."""
     if lattice.closes_at_border:
         border = border_vertices(lattice, type(inside))
@@ -32,7 +32,7 @@ def closed_signs(inside: Any, lattice: Lattice) -> Any:
     return inside
 
 
-def sign_changes(inside: Any, lattice: Lattice) -> Any:
+def sign_changes(inside: UInt32, lattice: Lattice) -> UInt32:
     """The cells of a whole lattice that have corners of different signs."""
     uint_t = type(inside)
     word = dr.arange(uint_t, dr.width(inside))
@@ -52,7 +52,7 @@ def sign_changes(inside: Any, lattice: Lattice) -> Any:
     return set_bits(active & _bits_before(word, lattice.vertex_count))
 
 
-def vertices_near(cells: Any, lattice: Lattice, reach: int) -> Any:
+def vertices_near(cells: UInt32, lattice: Lattice, reach: int) -> UInt32:
     """Ids of the vertices within ``reach`` along each axis of a cell's corners, and few others; ascending.
 
     Args:
@@ -84,7 +84,7 @@ def vertices_near(cells: Any, lattice: Lattice, reach: int) -> Any:
     return set_bits(near & _bits_before(word, lattice.vertex_count))
 
 
-def _shifted(inside: Any, word: Any, words: Any, bits: Any) -> Any:
+def _shifted(inside: UInt32, word: UInt32, words: UInt32, bits: UInt32) -> UInt32:
     """The signs that lie ``words`` and ``bits`` after those of each word; arbitrary where there are none."""
     last = dr.opaque(type(word), dr.width(inside) - 1)
     low = dr.gather(type(word), inside, dr.minimum(word + words, last))
@@ -92,7 +92,7 @@ def _shifted(inside: Any, word: Any, words: Any, bits: Any) -> Any:
     return low >> bits | high << (31 - bits) << 1
 
 
-def _bits_before(word: Any, vertex: int) -> Any:
+def _bits_before(word: UInt32, vertex: int) -> UInt32:
     """Per word the bits of the vertices before ``vertex``."""
     uint_t = type(word)
     whole, rest = dr.opaque(uint_t, vertex // 32), dr.opaque(uint_t, vertex % 32)
@@ -100,7 +100,7 @@ def _bits_before(word: Any, vertex: int) -> Any:
     return dr.select(word < whole, MISSING, dr.select(word == whole, part, 0))
 
 
-def border_vertices(lattice: Lattice, uint_t: type) -> Any:
+def border_vertices(lattice: Lattice, uint_t: type[UInt32]) -> UInt32:
     """Ids of the vertices on the six faces of the lattice; those on its edges more than once."""
     stride = dr.opaque(uint_t, lattice.stride)
     plane = stride * stride

@@ -1,14 +1,15 @@
 """Signs of a field, one bit per vertex, in words of 32; and the numbers of the bits that are set."""
 
-from typing import Any
 
 import drjit as dr
+
+from ..arrays import Bool, Float, UInt32
 
 #: Values below this are negative. Not 0: some threads flush denormal numbers to 0 and others do not.
 NEGATIVE = -(2.0**-126)
 
 
-def pack_signs(s: Any) -> Any:
+def pack_signs(s: Float) -> UInt32:
     """Words of 32 signs; bit i of word w: the value 32 w + i is negative. Missing values repeat the last."""
     uint_t = dr.uint32_array_t(type(s))
     word = dr.arange(uint_t, -(-dr.width(s) // 32))
@@ -21,12 +22,12 @@ def pack_signs(s: Any) -> Any:
     return inside
 
 
-def is_set(words: Any, vertex: Any, active: Any = True) -> Any:
+def is_set(words: UInt32, vertex: UInt32, active: Bool | bool = True) -> Bool:
     """Whether the bits of vertices are set; of signs: whether the vertices are inside."""
     return dr.gather(type(words), words, vertex >> 5, active) >> (vertex & 31) & 1 == 1
 
 
-def expand(bits: Any, log2_slots: int) -> tuple[Any, Any]:
+def expand(bits: UInt32, log2_slots: int) -> tuple[UInt32, UInt32]:
     """The set bits of an array of bit sets in order, as (index of the set, number of the bit)."""
     uint_t = type(bits)
     mask = (1 << log2_slots) - 1
@@ -38,7 +39,7 @@ def expand(bits: Any, log2_slots: int) -> tuple[Any, Any]:
     return lane >> log2_slots, lane & mask
 
 
-def set_bits(words: Any) -> Any:
+def set_bits(words: UInt32) -> UInt32:
     """The numbers of the set bits of a stream of words."""
     uint_t = type(words)
     dr.eval(words)

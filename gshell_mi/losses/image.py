@@ -7,13 +7,14 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
+from ..arrays import AnyArray, ArrayT
 from ..means import mean, mean_where
 
 #: Keeps relative losses finite in the dark: radiance below this counts as this.
 _RELATIVE_FLOOR = 0.01
 
 
-def tonemap(radiance):
+def tonemap(radiance: ArrayT) -> ArrayT:
     """Logarithmic tone curve ``log(1 + x)``: bright pixels stop dominating; 0 stays 0."""
     return dr.log(1 + dr.maximum(radiance, 0))
 
@@ -48,7 +49,7 @@ def l1(image: mi.TensorXf | mi.Color3f, target: mi.TensorXf | mi.Color3f) -> mi.
 IMAGE_LOSSES: dict[str, Callable] = {"log_l1": log_l1, "smape": smape, "relative_l2": relative_l2, "l1": l1}
 
 
-def mask_l2(alpha, target) -> mi.Float:
+def mask_l2(alpha: AnyArray, target: AnyArray | float) -> mi.Float:
     """Mean squared difference of coverage."""
     return mean(dr.square(alpha - target))
 
@@ -59,7 +60,7 @@ def chroma_difference(first: mi.Color3f, second: mi.Color3f, active: mi.Bool | N
     Args:
         active: the entries that count; default all.
     """
-    def chroma(color):
+    def chroma(color: mi.Color3f) -> mi.Color3f:
         return color / dr.maximum(color.x + color.y + color.z, 1e-4)
 
     squared = dr.squared_norm(chroma(first) - chroma(second))

@@ -43,7 +43,7 @@ class ReportConfig:
     views: int = 8
     """Views that are shown, spread evenly over the training views."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.views < 1:
             raise UserError(f"--views must be at least 1, not {self.views}.")
 
@@ -71,7 +71,7 @@ def _write(folder: Path, metrics: dict, config: ReportConfig) -> Path:
     with tempfile.TemporaryDirectory() as place:
         (video,) = write_video(frames, Path(place) / "turntable.mp4", turntable.fps, gif=False)
         video_data = _data_url("video/mp4", video.read_bytes())
-    page = files(__package__) / "page"
+    page = files("gshell_mi.report") / "page"
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
                                      lstrip_blocks=True)
     environment.filters["counted"] = counted

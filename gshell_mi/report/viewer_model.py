@@ -40,7 +40,7 @@ def viewer_model(folder: Path) -> bytes:
                           {"pbrMetallicRoughness": {"baseColorFactor": [0.25, 0.4, 0.7, 0],
                                                     "metallicFactor": 0, "roughnessFactor": 0.6},
                            "alphaMode": "BLEND"}))
-    tubes = boundary_tubes(mesh.vertices @ turn.T, mesh.faces, _TUBE_RADIUS * diagonal)
+    tubes = boundary_tubes(mesh.vertices @ turn.T, mesh.faces, _TUBE_RADIUS * float(diagonal))
     if tubes:
         parts.append(Part("boundary loops", tubes[1], {"POSITION": tubes[0]},
                           {"pbrMetallicRoughness": {"baseColorFactor": [0.6, 0, 0.25, 1], "metallicFactor": 0,

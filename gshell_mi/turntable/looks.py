@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..material import principled
+
+_Shade: TypeAlias = """Callable[[mi.SurfaceInteraction3f, mi.PreliminaryIntersection3f, mi.Float],
+                              tuple[mi.Color3f, mi.Float]]"""
 
 #: Back faces of the open mesh, linear Rec.709: the orange of the G-Shell paper's figures.
 ORANGE = (0.9, 0.32, 0.03)
@@ -84,7 +89,7 @@ class Studio:
         image = self._cast(sensor, seed, self._unlit)
         return _over(image, self._cast(sensor, seed, self._wires)) if self.look.wireframe else image
 
-    def _cast(self, sensor: mi.Sensor, seed: int, shade) -> np.ndarray:
+    def _cast(self, sensor: mi.Sensor, seed: int, shade: _Shade) -> np.ndarray:
         """Means over each pixel of ``shade(surface interaction, preliminary interaction, pixel size)``."""
         width, height = sensor.film().crop_size()
         count = width * height * _CAST_SAMPLES
@@ -104,7 +109,8 @@ class Studio:
         means = [np.array(dr.block_sum(x, _CAST_SAMPLES)) / _CAST_SAMPLES for x in channels]
         return np.stack(means, axis=-1).reshape(height, width, 4)
 
-    def _unlit(self, si, preliminary, pixel_size):
+    def _unlit(self, si: mi.SurfaceInteraction3f, preliminary: mi.PreliminaryIntersection3f,
+               pixel_size: mi.Float) -> tuple[mi.Color3f, mi.Float]:
         shape = self._scene.shapes()[0]
         if self.look.channel == "normal":
             color = mi.Color3f(0.5 * si.sh_frame.n + 0.5)
@@ -116,7 +122,8 @@ class Studio:
             color = dr.select(dr.dot(si.n, si.to_world(si.wi)) < 0, mi.Color3f(ORANGE), color)
         return color, mi.Float(1)
 
-    def _wires(self, si, preliminary, pixel_size):
+    def _wires(self, si: mi.SurfaceInteraction3f, preliminary: mi.PreliminaryIntersection3f,
+               pixel_size: mi.Float) -> tuple[mi.Color3f, mi.Float]:
         """Black along the edges: the distance to the nearest one against the size of a pixel there."""
         shape = self._scene.shapes()[0]
         prim = dr.select(preliminary.is_valid(), preliminary.prim_index, 0)
@@ -134,6 +141,6 @@ def _over(image: np.ndarray, above: np.ndarray) -> np.ndarray:
 
 
 def _denoised(color: np.ndarray) -> np.ndarray:
-    import mitsuba_oidn
+    import mitsuba_oidn  # pyright: ignore[reportMissingImports]  # an extra
 
     return np.asarray(mitsuba_oidn.denoise(np.ascontiguousarray(color, np.float32), hdr=True))

@@ -45,7 +45,7 @@ class TurntableConfig:
     denoise: bool = True
     """Filter path-traced pictures with Open Image Denoise, if it is installed."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("frames", "size", "spp"):
             if getattr(self, name) < 1:
                 raise UserError(f"--{name} must be at least 1, not {getattr(self, name)}.")

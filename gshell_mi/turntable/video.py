@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import imageio_ffmpeg
 import numpy as np
@@ -58,14 +58,14 @@ def _write_film(frames: Iterable[np.ndarray], path: Path, fps: float, *, keep: b
             pixels = np.ascontiguousarray((np.clip(frame, 0, 1) * 255 + 0.5).astype(np.uint8))
             if sink is None:
                 sink = stack.enter_context(_ffmpeg(path, pixels.shape[1::-1], fps))
-            sink.write(pixels)
+            sink.write(pixels.data)
             if keep:
                 pictures.append(Image.fromarray(pixels).quantize(128))
     return pictures
 
 
 @contextmanager
-def _ffmpeg(path: Path, size: tuple[int, int], fps: float) -> Iterator[BinaryIO]:
+def _ffmpeg(path: Path, size: tuple[int, int], fps: float) -> Iterator[IO[bytes]]:
     """Takes 8-bit RGB frames of ``size`` (width, height); at the end, the MP4 is whole.
 
     Raises:
@@ -86,6 +86,7 @@ def _ffmpeg(path: Path, size: tuple[int, int], fps: float) -> Iterator[BinaryIO]
         broken = False
         try:
             try:
+                assert process.stdin is not None, "it is a pipe"
                 yield process.stdin
                 process.stdin.close()
             except BrokenPipeError:  # it has ended before; why, it says below

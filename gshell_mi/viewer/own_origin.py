@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import http
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 from ..errors import UserError
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request
 
 #: The names by which a browser may know this machine; behind ``ssh -L`` the port is another one.
 _NAMES = {"localhost", "127.0.0.1", "[::1]"}
@@ -42,8 +47,9 @@ def guarded_server() -> Iterator[None]:
 
     serve, guarded = server.serve, []
 
-    def serve_guarded(*arguments, process_request=None, **others):
-        def answer(connection, request):
+    def serve_guarded(*arguments: Any, process_request: Callable[..., Any] | None = None,
+                      **others: Any) -> Any:
+        def answer(connection: ServerConnection, request: Request) -> Any:
             if not is_own(request.headers.get("Host"), request.headers.get("Origin")):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "This page belongs to another origin.\n")
             return process_request(connection, request) if process_request else None

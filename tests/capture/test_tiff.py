@@ -45,3 +45,15 @@ def test_colours_that_are_not_rgb(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", np.zeros((6, 8, 4), np.uint8), photometric="separated")
     with pytest.raises(UserError, match="colours are stored as SEPARATED"):
         read_pixels(tmp_path / "a.tif")
+
+
+def test_colours_of_no_known_kind_are_told(tmp_path):
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, (255 * PIXELS[..., :3]).astype(np.uint8), photometric="rgb")
+    with tifffile.TiffFile(path) as file:
+        place = file.pages.first.tags["PhotometricInterpretation"].valueoffset
+    data = bytearray(path.read_bytes())
+    data[place:place + 2] = (12345).to_bytes(2, "little")
+    path.write_bytes(data)
+    with pytest.raises(UserError, match="12345"):
+        read_pixels(path)

@@ -75,6 +75,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
         UserError: the model is cut off or malformed, a camera model is not supported, an image is missing.
     """
     model = find(source)
+    assert model is not None, "``find`` knows the source"
     images = images or _image_folder(source, model)
     others = [path for path in _models(model.parent) if path != model] if model != source else []
     notes = [f"'{model.parent}' has {len(others) + 1} models; '{model.name}' is taken, as it has the most "
@@ -123,12 +124,12 @@ def _camera(model: str, width: int, height: int, p: np.ndarray, pose: np.ndarray
     if model == "SIMPLE_PINHOLE":
         return Camera(width, height, p[0], p[0], p[1], p[2], pose)
     if model == "PINHOLE":
-        return Camera(width, height, *p, pose)
+        return Camera(width, height, *p[:4], to_world=pose)
     if model == "SIMPLE_RADIAL":
         return Camera(width, height, p[0], p[0], p[1], p[2], pose, Distortion(p[3]))
     if model == "RADIAL":
         return Camera(width, height, p[0], p[0], p[1], p[2], pose, Distortion(p[3], p[4]))
-    return Camera(width, height, *p[:4], pose, Distortion(*p[4:]))
+    return Camera(width, height, *p[:4], to_world=pose, distortion=Distortion(*p[4:]))
 
 
 def _check_model(model: str, path: Path) -> None:

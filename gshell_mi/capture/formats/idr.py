@@ -37,6 +37,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
         UserError: the file is malformed, or the numbers of cameras and images differ.
     """
     path = find(source)
+    assert path is not None, "``find`` knows the source"
     root = source if source.is_dir() else source.parent
     folder = images or next((root / name for name in _FOLDERS if (root / name).is_dir()), None)
     if folder is None:

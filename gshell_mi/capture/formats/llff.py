@@ -34,6 +34,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
         UserError: the file is malformed, or the numbers of poses and images differ.
     """
     path = find(source)
+    assert path is not None, "``find`` knows the source"
     folder = images or path.parent / "images"
     if not folder.is_dir():
         raise UserError(f"'{path}' has no folder 'images' beside it; name it with --images.")

@@ -50,6 +50,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
             another size than its film.
     """
     path = find(source)
+    assert path is not None, "``find`` knows the source"
     try:
         path.read_text(encoding="utf-8")    # Mitsuba would take other bytes for names
     except (OSError, UnicodeDecodeError) as error:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -121,7 +121,7 @@ class _Finder:
             found, where = existing(named), f"Image '{named}' of {owner} is missing"
             cure = "put it there, or name the folder of the images with --images"
         else:
-            found = self.copies.find(self.images, name)
+            found = self.copies.find(self.images, str(name))
             where = f"Image '{name}' of {owner} is not in '{self.images}'"
             cure = "put it there under its own name, in folders as in its path where names repeat"
         if found is None:
@@ -169,6 +169,12 @@ def _camera(values: dict[str, Any], pose: np.ndarray, image: Path, owner: str) -
         raise UserError(f"The camera of {owner} is of the kind {other}, which is not supported; undistort "
                         f"the images to a pinhole camera first.")
 
+    @overload
+    def number(key: str, default: float, *, positive: bool = False) -> float: ...
+
+    @overload
+    def number(key: str, default: None = None, *, positive: bool = False) -> float | None: ...
+
     def number(key: str, default: float | None = None, *, positive: bool = False) -> float | None:
         value = values.get(key)
         if value is None:
@@ -185,12 +191,13 @@ def _camera(values: dict[str, Any], pose: np.ndarray, image: Path, owner: str) -
     height = round(number("h", size[1], positive=True))
     fx = number("fl_x", positive=True) or _focal(number("camera_angle_x", positive=True), width, owner)
     fy = number("fl_y", positive=True) or _focal(number("camera_angle_y", positive=True), height, owner)
-    if fx is None and fy is None:
+    fx, fy = fx or fy, fy or fx
+    if fx is None or fy is None:
         raise UserError(f"{owner[0].upper()}{owner[1:]} has no focal length: neither fl_x nor "
                         f"camera_angle_x; add one, in pixels or radians.")
     distortion = Distortion(*(number(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4")))
-    declared = Camera(width, height, fx or fy, fy or fx, number("cx", width / 2), number("cy", height / 2),
-                      pose, distortion)
+    declared = Camera(width, height, fx, fy, number("cx", width / 2), number("cy", height / 2), pose,
+                      distortion)
     return camera_for_image(declared, size, image)
 
 
