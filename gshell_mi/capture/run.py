@@ -31,13 +31,12 @@ from .prepare import Preparation, exposure_gains
 from .region import FLIPPED_AXES, find_box, likely_misreading
 from .staging import staged
 from .trouble import Thumbnail, find_trouble
+from .white import FULL, ignored_white_of, white_of
 from .workspace import Progress
 from .writer import clipping_depths, scene_xml, sensors_xml, write_known, write_record, write_target
 
 #: An object farther from the origin than so many of its sizes is moved there.
 _FAR = 50.0
-#: Masks whose largest coverage is less do not reach white; a rounded one may miss it by a little.
-_FAINT_MASK = 0.95
 
 
 @dataclass(frozen=True)
@@ -121,8 +120,14 @@ class _Import:
         self.capture = replace(capture, frames=tuple(
             replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames))
         gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
-        self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains)
+        given = background is None and "masks" not in self.made
+        white = white_of(self.capture.frames) if given else 1.0
+        self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains,
+                                       white, ignored_white_of(self.capture.frames))
         self.warnings = [*capture.notes, *_profile_warning(capture, config)]
+        if white < 1:
+            self.warnings.append(f"The largest value of the masks is {255 * white:.3g} of 255 ({white:.2g}); "
+                                 f"it is taken for white, which is 1.")
         if "masks" not in self.made:
             self.warnings += _turned_warning(capture)
         self.cameras: dict[str, Camera] = {}
@@ -168,7 +173,7 @@ class _Import:
             if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
                 empty.append(frame.image.name)    # it would carve away everything that it frames
                 continue
-            if target.covered < _FAINT_MASK:
+            if target.covered < FULL:
                 faint[frame.image.name] = target.covered
             name = f"test_{len(self.tests):03}" if frame.held_out else f"view_{len(self.cameras):03}"
             place = folder / "test" if frame.held_out else folder
@@ -194,7 +199,8 @@ class _Import:
             self.warnings.append(f"{len(empty)} {what} left out: {some}.")
         if faint:
             some = ", ".join(f"{name} ({share:.2f})" for name, share in list(faint.items())[:3])
-            self.warnings.append(f"{counted(len(faint), 'mask')} nowhere reach full coverage; the largest is "
+            self.warnings.append(f"{counted(len(faint), 'mask')} nowhere "
+                                 f"{'reaches' if len(faint) == 1 else 'reach'} full coverage; the largest is "
                                  f"{some}{' ...' if len(faint) > 3 else ''}: the object counts as half "
                                  f"transparent; write masks that are white (255, 1.0) on the object.")
 

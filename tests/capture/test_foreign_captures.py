@@ -18,7 +18,9 @@ from gshell_mi.capture.formats import colmap
 from gshell_mi.capture.frames import Frame
 from gshell_mi.capture.masks import assign_masks, coverage_of
 from gshell_mi.capture.run import import_capture
+from gshell_mi.capture.white import ignored_white_of, white_of
 from gshell_mi.errors import UserError
+from gshell_mi.scene import load_fit_scene
 
 CAMERAS = known_cameras(8, width=16, height=12, fx=20.0, fy=20.0, cx=8.0, cy=6.0)
 
@@ -252,17 +254,63 @@ def test_masks_that_were_turned_as_exif_tells(orientation, larger, tmp_path):
     np.testing.assert_allclose(found, values / 255, atol=1e-6)
 
 
-def test_grey_masks_are_told(nerf, tmp_path):
-    def edit(document):
-        for frame in document["frames"]:
-            rgba = np.array(Image.open(nerf / frame["file_path"]))
-            rgba[..., 3] = rgba[..., 3] // 4 * 3
-            Image.fromarray(rgba).save(nerf / frame["file_path"])
+def rescaled_alpha(nerf, level):
+    """Gives the alpha of each frame's image another largest value; ``level`` of the frame's number."""
+    document = json.loads((nerf / "transforms.json").read_text(encoding="utf-8"))
+    for number, frame in enumerate(document["frames"]):
+        rgba = np.array(Image.open(nerf / frame["file_path"]))
+        rgba[..., 3] = np.round(rgba[..., 3] / 255.0 * level(number))
+        Image.fromarray(rgba).save(nerf / frame["file_path"])
 
-    change(nerf, edit)
+
+def largest_coverage(result):
+    """The largest alpha of each training target."""
+    return [target.rgba[..., 3].max() for target in load_fit_scene(result.path).targets]
+
+
+@pytest.mark.parametrize("level", [200, 128, 1])
+def test_masks_of_another_white_are_stretched(level, nerf, tmp_path):
+    rescaled_alpha(nerf, lambda number: level)
     result = import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(resolution=8))
-    told = [warning for warning in result.warnings if "nowhere reach full coverage" in warning]
-    assert told and told[0].startswith("8 masks") and "frame_00000.png (0.74)" in told[0]
+    np.testing.assert_allclose(largest_coverage(result), 1, atol=1e-3)
+    assert any(f"masks is {level} of 255" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_mask_files_of_another_white_are_stretched(inverted, tmp_path):
+    values = np.zeros((6, 8), np.uint8)
+    values[2:4, 2:6] = 128
+    if inverted:
+        values = 128 - values
+    Image.fromarray(values).save(tmp_path / "mask.png")
+    frame = Frame(tmp_path / "a.png", Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4)), tmp_path / "mask.png",
+                  ignored=tmp_path / "mask.png")
+    white = white_of([frame] * 3)
+    assert white == ignored_white_of([frame]) == pytest.approx(128 / 255)
+    found = coverage_of(frame, np.zeros((6, 8, 3), np.uint8), inverted=inverted, white=white)
+    expected = np.zeros((6, 8))
+    expected[2:4, 2:6] = 1
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(read_ignored(frame, (6, 8), 1, white), abs(expected - inverted), atol=1e-6)
+
+
+def test_masks_that_disagree_or_are_feathered_are_as_they_are(tmp_path):
+    frames = []
+    fade = np.round(200 * np.exp(-((np.arange(64) - 32) / 12.0) ** 2))
+    for name, values in (("full", [0, 255]), ("faint", [0, 200]), ("fainter", [0, 90]), ("feathered", fade)):
+        Image.fromarray(np.outer(np.ones(8), values).astype(np.uint8)).save(tmp_path / f"{name}.png")
+        frames.append(Frame(tmp_path / "a.png", Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4)),
+                            tmp_path / f"{name}.png"))
+    full, faint, fainter, feathered = frames
+    assert white_of([faint, full]) == white_of([faint, fainter]) == white_of([feathered] * 2) == 1
+
+
+def test_one_faint_mask_is_told(nerf, tmp_path):
+    rescaled_alpha(nerf, lambda number: 191 if number == 0 else 255)
+    result = import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(resolution=8))
+    told = [warning for warning in result.warnings if "nowhere" in warning]
+    assert told and told[0].startswith("1 mask ") and "frame_00000.png (0.75)" in told[0]
+    assert largest_coverage(result)[0] == pytest.approx(191 / 255, abs=1e-3)
 
 
 # --- what is written
