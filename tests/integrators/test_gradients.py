@@ -18,8 +18,7 @@ QUICK = ["sphere_translating", "sheet_scaling", "sharp_pleats", "cube_flat_shade
 
 
 def path(case, **options):
-    return mi.load_dict({"type": "gshell_path", "max_depth": case.depth, "reparam_depth": case.depth,
-                         "hide_emitters": True, **options})
+    return mi.load_dict({"type": "gshell_path", "max_depth": case.depth, "hide_emitters": True, **options})
 
 
 def weighted(images):
