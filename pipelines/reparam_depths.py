@@ -7,7 +7,6 @@ the image's colours is compared with finite differences of Mitsuba's ``path``
 (``pipelines/surface_differences.py``). Prints the rows of a table for ``pipelines/gradients_notes.md``:
 figures after ± are one standard error, "time" is the processor time of a forward derivative in units of that
 with ``reparam_depth`` 1.
-``reparam_depth`` 1.
 """
 
 import os

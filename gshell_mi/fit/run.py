@@ -146,6 +146,8 @@ class _Fit:
             folder.check(scene_inputs(scene) | self.scene.target_files, self.views.ids)
         if not all(target.has_alpha for target in self.scene.targets):
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
+        for note in self.scene.notes:
+            progress.warn(note)
         # Given fields may have detail that no coarser lattice holds.
         coarse = last.resolution if self.scene.subject.filename else config.start_resolution
         self.lattice = make_lattice(EARLY_GRIDS[last.grid], min(last.resolution, coarse))
