@@ -4,9 +4,9 @@
 
 Each command runs to its end twice on a small object, which tells how long it takes and what it writes. Then
 it is killed at ``--kills`` moments drawn uniformly from that time; after each kill every file is read as its
-users read it. A fit goes on with ``--resume`` until it is done, and begins anew then. Whenever a run comes to its
-end, its result must be that of the runs that nothing has killed; after the last one, nothing may be left over and
-no input may have changed. Prints a row for each command; exit code 1 if anything is not so.
+users read it. A fit goes on with ``--resume`` until it is done, and begins anew then. Whenever a run comes to
+its end, its result must be that of the runs that nothing has killed; after the last one, nothing may be left
+over and no input may have changed. Prints a row for each command; exit code 1 if anything is not so.
 ``pipelines/kill_and_resume.py`` does the same to one large fit.
 """
 
@@ -45,8 +45,8 @@ COMMANDS = {
              "--second-look", "1"], "out"),
 }
 
-#: How far a fit's surface may be from that of a whole one, in % of its diagonal, and as a multiple of what two
-#: whole ones differ by: threads add up in an order that changes, and steps carry that on.
+#: How far a fit's surface may be from that of a whole one, in % of its diagonal, and as a multiple of what
+#: two whole ones differ by: threads add up in an order that changes, and steps carry that on.
 _APART, _TIMES = 0.2, 3
 
 
@@ -155,7 +155,8 @@ def _going_on(name: str, place: Path) -> list[str]:
 
 def _inputs(folder: Path) -> dict[str, bytes]:
     """What no command may change."""
-    paths = [*(folder / "in").rglob("*"), *(folder / "set").rglob("*"), *folder.glob("*/notes.json")]
+    paths = [*(folder / "in").rglob("*"), *(folder / "set").rglob("*"),
+             *(folder / name / "notes.json" for name in ("out", "fit"))]
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths if path.is_file()}
 
 
