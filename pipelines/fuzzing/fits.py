@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from random import Random
 
@@ -14,10 +13,6 @@ from gshell_mi.errors import UserError
 
 from .mutators import damage_file, damaged_array
 from .target import command
-
-#: Of each kind of fit, what a scene needs.
-_FILES = ("mesh.ply", "template.ply", "scene.xml", "light.exr")
-
 
 def _finished(folder: Path) -> None:
     from fitted import open_sphere, write_fit
@@ -30,15 +25,18 @@ def _finished(folder: Path) -> None:
 
 
 def write_fit_with_targets(folder: Path) -> None:
-    """A finished fit, its targets, and a copy of it to export from."""
+    """A finished fit and its targets."""
     _finished(folder)
     (folder / "targets").mkdir()
     for number in range(2):
         bitmap = mi.Bitmap(np.ones((8, 8, 4), np.float32), mi.Bitmap.PixelFormat.RGBA)
         bitmap.write(str(folder / "targets" / f"view_{number:03}.exr"))
+
+
+def write_fit_to_export(folder: Path) -> None:
+    """A finished fit in a folder of its own, which is written into."""
     (folder / "out").mkdir()
-    for name in _FILES:
-        shutil.copy(folder / name, folder / "out")
+    _finished(folder / "out")
 
 
 def write_reported_fit(folder: Path) -> None:
@@ -70,12 +68,12 @@ def compare(folder: Path) -> None:
     """The command, images and mesh."""
     from gshell_mi.compare.__main__ import main
 
-    command(main, folder, "--targets", folder / "targets", "--mesh", folder / "out" / "mesh.ply",
+    command(main, folder, "--targets", folder / "targets", "--mesh", folder / "template.ply",
             "--spp", "1", "--json", folder / "out.json", "-o", folder / "out_errors")
 
 
 def export(folder: Path) -> None:
-    """``mesh.glb`` of the copy."""
+    """``mesh.glb``."""
     from gshell_mi.export.asset import AssetConfig, write_asset
 
     write_asset(folder / "out", AssetConfig(texture_size=16, unwrap_seconds=5))
