@@ -14,6 +14,7 @@ from gshell_mi.errors import UserError
 from .mutators import damage_file, damaged_array
 from .target import command
 
+
 def _finished(folder: Path) -> None:
     from fitted import open_sphere, write_fit
 

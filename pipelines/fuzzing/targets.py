@@ -215,7 +215,7 @@ TARGETS = {
        for suffix in ("mp4", "avi", "mkv")},
     "turntable": Target(write_fit_with_targets, film, "mesh.ply", "scene.xml", "light.exr"),
     "compare": Target(write_fit_with_targets, compare, "mesh.ply", "template.ply", "scene.xml", "light.exr",
-                      "view_*.exr"),
+                      "view_*.exr", keeps="out_errors"),
     "export": Target(write_fit_to_export, export, "mesh.ply", "scene.xml", "light.exr"),
     "report": Target(write_reported_fit, report, "metrics.json", "log.jsonl", "scene.xml", "light.exr",
                      "mesh.glb", "mesh.ply", "view_*.png"),
