@@ -213,6 +213,8 @@ class _Import:
             turned = self.to_scene[:3, :3] @ region.mean(axis=0)
             region = _cube(region) - region.mean(axis=0) + turned
         box = find_box(silhouettes, region)
+        if box is None and region is not None:    # such as a unit sphere that nobody has fitted to the object
+            box = find_box(silhouettes)
         if box is None:
             misreading = likely_misreading(silhouettes, self.to_scene)
             cure = "check the masks and cameras, or give --box and look at the picture of --check"

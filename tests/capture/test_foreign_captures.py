@@ -7,7 +7,15 @@ import shutil
 import mitsuba as mi
 import numpy as np
 import pytest
-from known_capture import known_cameras, straight_png, write_colmap, write_nerf
+from known_capture import (
+    BALL,
+    RADIUS,
+    known_cameras,
+    straight_png,
+    write_colmap,
+    write_idr,
+    write_nerf,
+)
 from PIL import Image, ImageOps
 
 from gshell_mi.capture import CaptureConfig, read_capture
@@ -311,6 +319,62 @@ def test_one_faint_mask_is_told(nerf, tmp_path):
     told = [warning for warning in result.warnings if "nowhere" in warning]
     assert told and told[0].startswith("1 mask ") and "frame_00000.png (0.75)" in told[0]
     assert largest_coverage(result)[0] == pytest.approx(191 / 255, abs=1e-3)
+
+
+# --- cameras
+
+
+def idr_arrays(folder, edit):
+    """Changes the arrays of an IDR capture, written anew; returns its folder."""
+    write_idr(folder, CAMERAS)
+    with np.load(folder / "cameras_sphere.npz") as stored:
+        arrays = dict(stored)
+    for index, camera in enumerate(CAMERAS):
+        edit(arrays, index, camera)
+    np.savez(folder / "cameras_sphere.npz", **arrays)
+    return folder
+
+
+def pose_alone(arrays, index, camera):
+    to_camera = np.stack([camera.right, -camera.up, camera.forward])
+    arrays[f"world_mat_{index}"] = np.vstack([np.column_stack([to_camera, -to_camera @ camera.origin]),
+                                              [0, 0, 0, 1]])
+
+
+def test_poses_with_intrinsics_of_their_own(tmp_path):
+    """As in DVR's cameras.npz."""
+    def edit(arrays, index, camera):
+        pose_alone(arrays, index, camera)
+        arrays[f"camera_mat_{index}"] = np.diag([2 * camera.fx / camera.width, 2 * camera.fy / camera.height,
+                                                 1.0, 1.0])
+
+    capture = read_capture(idr_arrays(tmp_path, edit))
+    for frame, camera in zip(capture.frames, CAMERAS, strict=True):
+        found = frame.camera
+        assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx(
+            (camera.fx, camera.fy, camera.cx, camera.cy))
+        np.testing.assert_allclose(found.center, camera.origin, atol=1e-9)
+        np.testing.assert_allclose(found.forward, camera.forward, atol=1e-9)
+
+
+def test_poses_without_intrinsics_are_told(tmp_path):
+    with pytest.raises(UserError, match=r"camera 0 of .* is a pose without a focal length"):
+        read_capture(idr_arrays(tmp_path, pose_alone))
+
+
+def test_a_unit_sphere_that_nobody_has_fitted(tmp_path):
+    """The world is in other units and off the origin, and scale_mat is the identity."""
+    def edit(arrays, index, camera):
+        moved = np.diag([0.01, 0.01, 0.01, 1.0])
+        moved[:3, 3] = [-3, -4, -5]
+        arrays[f"world_mat_{index}"] = arrays[f"world_mat_{index}"] @ moved
+        arrays[f"scale_mat_{index}"] = np.eye(4)
+
+    folder = idr_arrays(tmp_path / "set", edit)
+    result = import_capture(folder, tmp_path / "a.xml", config=CaptureConfig(resolution=8, up="keep"))
+    center = (BALL + np.array([3, 4, 5])) * 100
+    np.testing.assert_allclose(result.box.mean(axis=0), center, atol=10)
+    assert np.ptp(result.box, axis=0).max() == pytest.approx(2 * RADIUS * 100, rel=0.3)
 
 
 # --- what is written
