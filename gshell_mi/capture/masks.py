@@ -139,7 +139,7 @@ def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None 
         return background.coverage(_unit(pixels[..., :3])).astype(np.float32)
     size = (frame.camera.width, frame.camera.height)
     if frame.mask is not None:
-        coverage = read_reduced_grey(frame.mask, size, reduction)
+        coverage = None if frame.turned else read_reduced_grey(frame.mask, size, reduction)
         if coverage is None:
             mask = mask_values(frame.mask)
             coverage = match_frame(mask, frame, pixels.shape[:2], reduction)

@@ -21,7 +21,7 @@ from ..wording import counted
 from .acquire import acquire, lacks_masks, make_masks
 from .camera import Camera
 from .config import AXES, CaptureConfig
-from .decoding import FLOAT_SUFFIXES, ColorDecoding, color_profile, exif_orientation
+from .decoding import FLOAT_SUFFIXES, ColorDecoding, color_profile
 from .evidence import assign_ignored
 from .formats import mitsuba
 from .frames import Capture, Frame
@@ -31,6 +31,7 @@ from .prepare import Preparation, exposure_gains
 from .region import FLIPPED_AXES, find_box, likely_misreading
 from .staging import staged
 from .trouble import Thumbnail, find_trouble
+from .turned import with_turned_masks
 from .white import FULL, ignored_white_of, white_of
 from .workspace import Progress
 from .writer import clipping_depths, scene_xml, sensors_xml, write_known, write_record, write_target
@@ -128,8 +129,9 @@ class _Import:
         if white < 1:
             self.warnings.append(f"The largest value of the masks is {255 * white:.3g} of 255 ({white:.2g}); "
                                  f"it is taken for white, which is 1.")
-        if "masks" not in self.made:
-            self.warnings += _turned_warning(capture)
+        if given:
+            self.capture, turned = with_turned_masks(self.capture, white, config.invert_masks)
+            self.warnings += turned
         self.cameras: dict[str, Camera] = {}
         self.tests: dict[str, Camera] = {}
         self.thumbnails: list[Thumbnail] = []
@@ -281,20 +283,6 @@ def _profile_warning(capture: Capture, config: CaptureConfig) -> list[str]:
         return []
     return [f"The photographs carry the colour profile '{profile}', but are read as sRGB: name their colour "
             f"space with --color-space."]
-
-
-def _turned_warning(capture: Capture) -> list[str]:
-    """If masks may be turned against photographs with an EXIF orientation, which their sizes do not tell."""
-    turned = [frame for frame in capture.frames
-              if frame.mask is not None and _is_ambiguous(exif_orientation(frame.image), frame.camera)]
-    if not turned:
-        return []
-    return [f"{counted(len(turned), 'photograph')} such as {turned[0].image.name} carry an EXIF orientation: "
-            f"their masks must be stored as their pixels are, not as viewers turn them."]
-
-
-def _is_ambiguous(orientation: int, camera: Camera) -> bool:
-    return orientation in (2, 3, 4) or (orientation > 4 and camera.width == camera.height)
 
 
 def to_scene(capture: Capture, up: str) -> np.ndarray:

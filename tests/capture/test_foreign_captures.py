@@ -262,6 +262,34 @@ def test_masks_that_were_turned_as_exif_tells(orientation, larger, tmp_path):
     np.testing.assert_allclose(found, values / 255, atol=1e-6)
 
 
+@pytest.mark.parametrize("follow", [True, False])
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_masks_that_were_turned_though_sizes_do_not_tell(orientation, follow, tmp_path):
+    """Photographs upside down or square, with masks of a tool that honours their EXIF orientation or not."""
+    width = 18 if orientation == 6 else 24
+    cameras = known_cameras(8, width=width, height=18, fx=20.0, fy=20.0, cx=width - 5.0, cy=5.5)
+    write_colmap(tmp_path / "set", cameras, binary=False)
+    model = tmp_path / "set" / "sparse" / "0" / "images.txt"
+    model.write_text(model.read_text().replace(".png", ".webp"))
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    images, masks = (sorted((tmp_path / "set" / name).iterdir()) for name in ("images", "masks"))
+    for image, mask in zip(images, masks, strict=True):
+        Image.open(image).save(image.with_suffix(".webp"), exif=exif, lossless=True)
+        stored = Image.open(mask)
+        stored.load()
+        if follow:
+            stored.getexif()[0x112] = orientation
+            stored = ImageOps.exif_transpose(stored)
+        stored.save(mask.with_name(image.name))
+        image.unlink()
+        mask.unlink()
+    result = import_capture(tmp_path / "set", tmp_path / "a.xml", config=CaptureConfig(resolution=8))
+    assert any("the masks are turned back" in warning for warning in result.warnings) == follow
+    for target, camera in zip(load_fit_scene(result.path).targets, cameras, strict=True):
+        np.testing.assert_allclose(target.rgba[..., 3], camera.render()[..., 3], atol=0.01)
+
+
 def rescaled_alpha(nerf, level):
     """Gives the alpha of each frame's image another largest value; ``level`` of the frame's number."""
     document = json.loads((nerf / "transforms.json").read_text(encoding="utf-8"))
