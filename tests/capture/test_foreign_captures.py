@@ -402,7 +402,7 @@ def test_a_unit_sphere_that_nobody_has_fitted(tmp_path):
     result = import_capture(folder, tmp_path / "a.xml", config=CaptureConfig(resolution=8, up="keep"))
     center = (BALL + np.array([3, 4, 5])) * 100
     np.testing.assert_allclose(result.box.mean(axis=0), center, atol=10)
-    assert np.ptp(result.box, axis=0).max() == pytest.approx(2 * RADIUS * 100, rel=0.3)
+    assert 200 * RADIUS < np.ptp(result.box, axis=0).max() < 300 * RADIUS    # masks are of few pixels
 
 
 # --- what is written
