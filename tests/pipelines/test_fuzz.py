@@ -18,7 +18,7 @@ from fuzzing.mutators import damage_file
 #: A few of each; some hundred inputs in ten seconds.
 QUICK = {"nerf": 12, "colmap_text": 12, "llff": 12, "images": 8, "scene": 6, "mesh_ply": 8, "mesh_obj": 8,
          "scores": 12, "fields": 40, "block_fields": 20, "light": 12, "masks": 8, "known": 8, "video_mp4": 6,
-         "compare": 8}
+         "compare": 8, "export": 6}
 
 
 @pytest.mark.parametrize("name", QUICK)
