@@ -207,11 +207,16 @@ def main(arguments: list[str] | None = None) -> int:
     mi.set_variant("llvm_ad_rgb")
     from fuzzing.targets import TARGETS
 
-    findings = fuzz(given.targets or list(TARGETS), 60 * given.minutes, seed=given.seed, most=given.most,
-                    limit=given.limit)
-    for outcome, count in sorted(findings.outcomes.items()):
-        print(f"{outcome:24} {count:7}")
-    print(*findings.kinds(), sep="\n")
+    findings, targets = Findings(), given.targets or list(TARGETS)
+    for target in targets:
+        found = fuzz([target], 60 * given.minutes / len(targets), seed=given.seed, most=given.most,
+                     limit=given.limit)
+        for outcome, count in sorted(found.outcomes.items()):
+            print(f"{outcome:24} {count:7}", flush=True)
+        for kind in found.kinds():
+            print(kind, flush=True)
+        findings.outcomes += found.outcomes
+        findings.failures += found.failures
     counts = ", ".join(f"{count} {kind}" for kind, count in findings.counts().items())
     print(f"{findings.tried} inputs: {counts}")
     return int(bool(findings.failures))
