@@ -11,6 +11,7 @@ import tyro
 
 from .doctor import ensure_variant
 from .interrupt import Interrupt
+from .kernel_cache import kernel_cache_problem
 from .streams import with_streams
 
 
@@ -50,6 +51,8 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
         with Interrupt() as interrupt:
             try:
                 ensure_variant(parsed.variant)
+                if problem := kernel_cache_problem():
+                    print(f"warning: {problem}", file=sys.stderr)
                 interrupt.check()
                 work(parsed)
             except KeyboardInterrupt:

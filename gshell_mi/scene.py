@@ -10,11 +10,15 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from .coincident import coincident_meshes
 from .compat import write_bitmap
 from .errors import UserError
 from .files import locked, name_trouble, remove_stale, replacing
 from .scene_files import load_scene
 from .targets import Target, depth_file, known_file, load_target
+
+#: Where no target has more alpha than this, the object would be half transparent.
+_FULL = 0.95
 
 #: Samples per pixel of targets rendered from a scene's reference.
 REFERENCE_SPP = 128
@@ -45,6 +49,16 @@ class FitScene:
     @property
     def name(self) -> str:
         return self.path.stem
+
+    @property
+    def notes(self) -> list[str]:
+        """What is hardly meant so, a sentence each; often none."""
+        notes = coincident_meshes(self.scene.shapes())
+        most = max(float(target.rgba[..., 3].max()) for target in self.targets)
+        if most < _FULL:
+            notes.append(f"No target has an alpha above {most:.2f}, so the object counts as half "
+                         f"transparent: alpha is coverage; write 1 where the object fills a pixel.")
+        return notes
 
     @property
     def target_files(self) -> set[Path]:

@@ -22,8 +22,13 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "pipelines")]
 
-#: Seconds that an input may take, and that a worker may take to start and to write good inputs.
+#: Seconds that an input may take, of the clock and of the processors, and that a worker may take to start and
+#: to write good inputs.
 LIMIT, START = 10.0, 300.0
+
+#: What failures are, by a word in their line; what has none of these is an exception that nobody caught.
+KINDS = {"ends the process": "crashes", "takes ": "hangs", "outside of the output": "files outside",
+         "left behind": "half-written files", "half-written": "half-written files", "": "tracebacks"}
 
 
 @dataclass
@@ -45,28 +50,37 @@ class Findings:
             kinds.setdefault(re.sub(r"\d+", "", failure), []).append(failure)
         return [f"{same[0]} ({len(same)} of the kind)" for same in kinds.values()]
 
+    def counts(self) -> Counter:
+        """How many failures there are of each of ``KINDS``."""
+        found = Counter(dict.fromkeys(KINDS.values(), 0))
+        for failure in self.failures:
+            found[next(kind for word, kind in KINDS.items() if word in failure)] += 1
+        return found
+
     @property
     def tried(self) -> int:
         return sum(self.outcomes.values()) + len(self.failures)
 
 
-def fuzz(targets: list[str], seconds: float, *, seed: int = 0, most: int = 10**9) -> Findings:
+def fuzz(targets: list[str], seconds: float, *, seed: int = 0, most: int = 10**9,
+         limit: float = LIMIT) -> Findings:
     """Tries damaged inputs of each target in turn, in a process of its own that may crash or hang.
 
     Args:
         seconds: for all of them together, without the processes' start.
         most: inputs per target.
+        limit: seconds of the clock that an input may take.
     """
     findings = Findings()
     for target in targets:
         first, left = 0, seconds / len(targets)
         while left > 0 and first < most:
-            first, spent = _worker(target, seed, first, left, most, findings)
+            first, spent = _worker(target, seed, first, left, most, limit, findings)
             left -= spent
     return findings
 
 
-def _worker(target: str, seed: int, first: int, seconds: float, most: int,
+def _worker(target: str, seed: int, first: int, seconds: float, most: int, limit: float,
             findings: Findings) -> tuple[int, float]:
     """Runs one process until the time is over or it dies; the next input's number, and the seconds spent."""
     reading, writing = os.pipe()
@@ -77,7 +91,7 @@ def _worker(target: str, seed: int, first: int, seconds: float, most: int,
             pass_fds=[writing], stdout=said, stderr=said, env=environment)
         os.close(writing)
         try:
-            return _watch(process, reading, target, first, seconds, findings, said)
+            return _watch(process, reading, target, first, seconds, findings, said, limit)
         finally:
             process.kill()
             process.wait()
@@ -85,10 +99,10 @@ def _worker(target: str, seed: int, first: int, seconds: float, most: int,
 
 
 def _watch(process: subprocess.Popen, reading: int, target: str, number: int, seconds: float,
-           findings: Findings, said) -> tuple[int, float]:
+           findings: Findings, said, most: float = LIMIT) -> tuple[int, float]:
     selector = selectors.DefaultSelector()
     selector.register(reading, selectors.EVENT_READ)
-    buffer, started, limit = b"", None, START
+    buffer, started, limit = b"", None, START * most / LIMIT
     while True:
         if not selector.select(limit):
             what = f"takes more than {limit:.0f} s"
@@ -98,7 +112,7 @@ def _watch(process: subprocess.Popen, reading: int, target: str, number: int, se
             *lines, buffer = buffer.split(b"\n")
             for line in lines:
                 number, started = _note(line.decode(), target, number, started, findings)
-            limit = LIMIT
+            limit = most
             if chunk and (started is None or time.monotonic() - started < seconds):
                 continue
             if chunk:
@@ -137,7 +151,18 @@ def work(writing: int, target: str, seed: int, first: int, most: int, folder: Pa
     TARGETS[target].prepare(inputs)
     os.write(writing, b"ready\n")
     for number in range(first, most):
-        os.write(writing, f"{attempt(target, inputs, seed, number)}\n".encode(errors="replace"))
+        begin = _processor_seconds()
+        outcome = attempt(target, inputs, seed, number)
+        spent = _processor_seconds() - begin
+        if spent > LIMIT and not outcome.startswith("failed"):
+            outcome = f"failed takes {spent:.0f} s of the processors"
+        os.write(writing, f"{outcome}\n".encode(errors="replace"))
+
+
+def _processor_seconds() -> float:
+    """Of this process and those that it has started and that have ended."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
 
 
 def attempt(target: str, inputs: Path, seed: int, number: int, *, tell: bool = False) -> str:
@@ -164,6 +189,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=10.0, help="of trying, all targets together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--targets", nargs="*", help="default: all")
+    parser.add_argument("--most", type=int, default=10**9, help="inputs of each target")
+    parser.add_argument("--limit", type=float, default=LIMIT,
+                        help="seconds that an input may take on the clock; more on a machine that is busy "
+                        f"(default {LIMIT:g}); of the processors it may always take {LIMIT:g}")
     parser.add_argument("--only", help="TARGET:NUMBER, to see one input fail")
     parser.add_argument("--worker", nargs=6, help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
@@ -178,11 +207,18 @@ def main(arguments: list[str] | None = None) -> int:
     mi.set_variant("llvm_ad_rgb")
     from fuzzing.targets import TARGETS
 
-    findings = fuzz(given.targets or list(TARGETS), 60 * given.minutes, seed=given.seed)
-    for outcome, count in sorted(findings.outcomes.items()):
-        print(f"{outcome:24} {count:7}")
-    print(*findings.kinds(), sep="\n")
-    print(f"{findings.tried} inputs, {len(findings.failures)} failures")
+    findings, targets = Findings(), given.targets or list(TARGETS)
+    for target in targets:
+        found = fuzz([target], 60 * given.minutes / len(targets), seed=given.seed, most=given.most,
+                     limit=given.limit)
+        for outcome, count in sorted(found.outcomes.items()):
+            print(f"{outcome:24} {count:7}", flush=True)
+        for kind in found.kinds():
+            print(kind, flush=True)
+        findings.outcomes += found.outcomes
+        findings.failures += found.failures
+    counts = ", ".join(f"{count} {kind}" for kind, count in findings.counts().items())
+    print(f"{findings.tried} inputs: {counts}")
     return int(bool(findings.failures))
 
 

@@ -117,8 +117,8 @@ def measure(case, resolution, seconds, few_error, parts):
         measured("half step", difference(case.step / 2), COARSE, seconds / 2)
     if "ours" in parts:
         def ours(light_edge_samples):
-            return mi.load_dict({"type": "gshell_path", "max_depth": case.depth, "reparam_depth": case.depth,
-                                 "light_edge_samples": light_edge_samples, "hide_emitters": True})
+            return mi.load_dict({"type": "gshell_path", "max_depth": case.depth, "hide_emitters": True,
+                                 "light_edge_samples": light_edge_samples})
 
         def forward(integrator, spp, first_seed=0):
             return lambda seed: gradient_scenes.forward_image(mover, integrator, spp, first_seed + seed)
@@ -189,8 +189,8 @@ HEADER = """# Derivatives, measured
 the derivative is that of a smoothly weighted sum of the image's colours. Figures after ± are one standard
 error. "FD" are central finite differences of the stock `path` integrator with Richardson's extrapolation of
 the steps h and 2 h, and the same with half of h. The two images of a difference share their random numbers
-and are sampled at points fixed on the surfaces (`pipelines/surface_differences.py`). `gshell_path` uses
-`reparam_depth` = depth, and `light_edge_samples` 16 at 128 spp, 1 at 4 spp. Every figure is repeated with
+and are sampled at points fixed on the surfaces (`pipelines/surface_differences.py`). `gshell_path` has
+its default `reparam_depth`, and `light_edge_samples` 16 at 128 spp, 1 at 4 spp. Every figure is repeated with
 new seeds until its standard error is 0.3 % (1 % at 4 spp, half step, and for Mitsuba's integrators) or
 the time is up. "Right": within 1 % of FD or two standard errors. "Corr.": correlation of the gradient image
 with that of finite differences (both blurred by one pixel). "fwd - rev": relative difference of forward

@@ -74,6 +74,24 @@ def test_other_shapes_and_lights_may_be_there(scene):
     assert fit.subject.id() == "subject" and fit.light.id() == "light"
 
 
+def test_a_mesh_twice_at_one_place_is_told(scene):
+    """Of different materials, as Mitsuba makes one mesh of those of equal ones."""
+    assert load_fit_scene(scene).notes == []
+    cubes = "".join(f'<shape type="cube" id="{name}"> <bsdf type="diffuse"> <rgb name="reflectance" '
+                    f'value="{value}"/> </bsdf> </shape>' for name, value in (("a", 0.2), ("b", 0.7)))
+    change(scene, "</scene>", cubes + "</scene>")
+    (note,) = load_fit_scene(scene).notes
+    assert note.partition(": ")[0] in {f"Mesh '{a}' has 12 faces that lie in faces of mesh '{b}'"
+                                       for a, b in ("ab", "ba")}
+
+
+def test_targets_that_nowhere_reach_full_coverage_are_told(scene):
+    for path in scene.with_suffix("").glob("*.exr"):
+        mi.Bitmap(np.array(mi.Bitmap(str(path))) * np.float32(0.5)).write(str(path))
+    (note,) = load_fit_scene(scene).notes
+    assert note.startswith("No target has an alpha above 0.50, so the object counts as half transparent")
+
+
 def test_another_folder_of_targets(scene, tmp_path):
     shutil.copytree(scene.with_suffix(""), tmp_path / "other")
     marked = np.full((SIZE, SIZE, 4), 0.25, np.float32)

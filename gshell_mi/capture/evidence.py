@@ -13,10 +13,9 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import UserError
-from .decoding import read_pixels
 from .file_names import Copies
 from .frames import Capture, Frame
-from .masks import mask_of
+from .masks import mask_of, mask_values, stretched
 from .reduced import match_frame
 
 #: Folder that is looked for beside the images.
@@ -81,19 +80,18 @@ def assign_ignored(capture: Capture, folder: Path | None) -> Capture:
                                          for frame, file in zip(capture.frames, found, strict=True)))
 
 
-def read_ignored(frame: Frame, shape: tuple[int, int], reduction: int) -> np.ndarray:
+def read_ignored(frame: Frame, shape: tuple[int, int], reduction: int, white: float = 1.0) -> np.ndarray:
     """(height, width) share of each pixel that a frame's ignore mask covers.
 
     Args:
         shape, reduction: of the image, as for ``match_size``.
+        white: the value that counts as 1, see ``ignored_white_of``.
 
     Raises:
         UserError: it cannot be read, or has another aspect than its image.
     """
     assert frame.ignored is not None, "the frame has an ignore mask"
-    stored = read_pixels(frame.ignored)
-    scale = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1
-    values = stored[..., :3].mean(axis=-1, dtype=np.float32) / np.float32(scale)
+    values = stretched(mask_values(frame.ignored), white)
     matched = match_frame(values, frame, shape, reduction)
     if matched is None:
         raise UserError(f"Ignore mask '{frame.ignored}' is {values.shape[1]} x {values.shape[0]} pixels, but "

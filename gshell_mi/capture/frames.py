@@ -22,6 +22,7 @@ class Frame:
         mask: the file of its coverage, if the format names one.
         held_out: kept for measuring; the fit does not see it.
         ignored: the file of its ignore mask, white where nothing is known, if there is one.
+        turned: its masks are stored as the image's EXIF orientation shows it, though their sizes do not tell.
     """
 
     image: Path
@@ -29,6 +30,7 @@ class Frame:
     mask: Path | None = None
     held_out: bool = False
     ignored: Path | None = None
+    turned: bool = False
 
 
 @dataclass(frozen=True)

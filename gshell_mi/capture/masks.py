@@ -123,7 +123,7 @@ def mask_of(image: Path) -> Path | None:
 
 
 def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None = None, *,
-                inverted: bool = False, reduction: int = 1) -> np.ndarray:
+                inverted: bool = False, reduction: int = 1, white: float = 1.0) -> np.ndarray:
     """(h, w) coverage in [0, 1] of a frame with the given stored pixels.
 
     A given background colour comes first, then the frame's mask, then alpha.
@@ -131,6 +131,7 @@ def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None 
     Args:
         inverted: mask files are black on the object.
         reduction: of the pixels, see ``read_reduced``.
+        white: the value that counts as 1 in mask files and in the alpha of integer files, see ``white_of``.
 
     Raises:
         UserError: there is none of them, or the mask has another aspect than the image.
@@ -139,17 +140,14 @@ def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None 
         return background.coverage(_unit(pixels[..., :3])).astype(np.float32)
     size = (frame.camera.width, frame.camera.height)
     if frame.mask is not None:
-        grey = read_reduced_grey(frame.mask, size, reduction)
-        if grey is not None:
-            return 1 - grey if inverted else grey
-        mask = read_pixels(frame.mask)
-        # Some tools put the mask into alpha and leave the colour empty or as it was.
-        in_alpha = mask.shape[2] == 4 and _unit(mask[..., 3]).min() < 1
-        values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
-        coverage = match_frame(np.clip(_unit(values, mask.dtype), 0, 1), frame, pixels.shape[:2], reduction)
+        coverage = None if frame.turned else read_reduced_grey(frame.mask, size, reduction)
         if coverage is None:
-            raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its image "
-                            f"is {size[0]} x {size[1]}; resize it.")
+            mask = mask_values(frame.mask)
+            coverage = match_frame(mask, frame, pixels.shape[:2], reduction)
+            if coverage is None:
+                raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its "
+                                f"image is {size[0]} x {size[1]}; resize it.")
+        coverage = stretched(coverage, white)
         return 1 - coverage if inverted else coverage
     if pixels.shape[2] < 4:
         raise UserError(f"Image '{frame.image}' has no alpha, and there is no mask for it; {_SUPPLY}.")
@@ -157,7 +155,30 @@ def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None 
     if (alpha == 1).all():
         raise UserError(f"Image '{frame.image}' has an alpha of 1 everywhere, and there is no mask for it; "
                         f"{_SUPPLY}.")
-    return alpha
+    return alpha if alpha_values(pixels) is None else stretched(alpha, white)
+
+
+def mask_values(path: Path) -> np.ndarray:
+    """(h, w) float32 of a mask file, in [0, 1].
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    mask = read_pixels(path)
+    # Some tools put the mask into alpha and leave the colour empty or as it was.
+    in_alpha = mask.shape[2] == 4 and _unit(mask[..., 3]).min() < 1
+    values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
+    return np.clip(_unit(values, mask.dtype), 0, 1)
+
+
+def alpha_values(pixels: np.ndarray) -> np.ndarray | None:
+    """(h, w) float32 alpha of the stored pixels of an integer file; None if they have none."""
+    return _unit(pixels[..., 3]) if pixels.shape[2] == 4 and pixels.dtype.kind == "u" else None
+
+
+def stretched(values: np.ndarray, white: float) -> np.ndarray:
+    """Values in [0, 1] of which ``white`` is to be 1."""
+    return values if white == 1 else np.clip(values / np.float32(white), 0, 1)
 
 
 def _unit(values: np.ndarray, stored: np.dtype | None = None) -> np.ndarray:

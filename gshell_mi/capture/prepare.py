@@ -55,6 +55,7 @@ class Preparation:
         inverted_masks: mask files are black on the object.
         max_size: longest side of a target in pixels; 0 keeps the images' size.
         gains: factor on a file's linear values that evens out its exposure; 1 where not named.
+        white, ignored_white: the values of masks on the object and of ignore masks, see ``white_of``.
     """
 
     decoding: ColorDecoding = field(default_factory=ColorDecoding)
@@ -62,6 +63,8 @@ class Preparation:
     inverted_masks: bool = False
     max_size: int = 0
     gains: dict[Path, float] = field(default_factory=dict)
+    white: float = 1.0
+    ignored_white: float = 1.0
 
     def target(self, frame: Frame) -> Prepared:
         """The target of a frame.
@@ -71,7 +74,7 @@ class Preparation:
         """
         pixels, reduction = read_reduced(frame.image, _DECODED * self.max_size)
         coverage = coverage_of(frame, pixels, self.background, inverted=self.inverted_masks,
-                               reduction=reduction)[..., None]
+                               reduction=reduction, white=self.white)[..., None]
         rgb = self.decoding.linear(pixels[..., :3])
         # In place, for a photograph of 24 megapixels takes 300 MB by now.
         if self.background is not None:
@@ -96,7 +99,7 @@ class Preparation:
         if self.background is None and frame.mask is not None:
             known[wide_grey(coverage[..., 0])] = 0
         if frame.ignored is not None:
-            known[..., 0] *= 1 - read_ignored(frame, coverage.shape[:2], reduction)
+            known[..., 0] *= 1 - read_ignored(frame, coverage.shape[:2], reduction, self.ignored_white)
         return known
 
     @staticmethod

@@ -13,9 +13,10 @@ from .decoding import exif_orientation, read_pixels
 from .frames import Frame
 
 _JPEG = (".jpg", ".jpeg")
-#: From an image as EXIF orientation shows it to as it is stored, where that exchanges width and height:
-#: photographs are read as stored, as calibrations see them, but tools that make masks may turn them.
-_TURNED_BACK = {5: lambda mask: mask.swapaxes(0, 1), 6: lambda mask: np.rot90(mask),
+#: From an image as EXIF orientation shows it to as it is stored: photographs are read as stored, as
+#: calibrations see them, but tools that make masks may turn them.
+_TURNED_BACK = {2: lambda mask: mask[:, ::-1], 3: lambda mask: np.rot90(mask, 2), 4: lambda mask: mask[::-1],
+                5: lambda mask: mask.swapaxes(0, 1), 6: lambda mask: np.rot90(mask),
                 7: lambda mask: np.rot90(mask, 2).swapaxes(0, 1), 8: lambda mask: np.rot90(mask, -1)}
 
 
@@ -85,8 +86,11 @@ def match_frame(mask: np.ndarray, frame: Frame, shape: tuple[int, int], reductio
     """``match_size`` for a mask (h, w) of a frame's image file; one that was turned as the image's EXIF
     orientation tells is turned back."""
     size = (frame.camera.width, frame.camera.height)
+    turned_back = _TURNED_BACK.get(exif_orientation(frame.image))
+    if frame.turned and turned_back:
+        return match_size(turned_back(mask), size, shape, reduction)
     matched = match_size(mask, size, shape, reduction)
-    if matched is None and (turned_back := _TURNED_BACK.get(exif_orientation(frame.image))):
+    if matched is None and turned_back:
         matched = match_size(turned_back(mask), size, shape, reduction)
     return matched
 

@@ -21,7 +21,7 @@ from ..wording import counted
 from .acquire import acquire, lacks_masks, make_masks
 from .camera import Camera
 from .config import AXES, CaptureConfig
-from .decoding import FLOAT_SUFFIXES, ColorDecoding, color_profile, exif_orientation
+from .decoding import FLOAT_SUFFIXES, ColorDecoding, color_profile
 from .evidence import assign_ignored
 from .formats import mitsuba
 from .frames import Capture, Frame
@@ -31,13 +31,13 @@ from .prepare import Preparation, exposure_gains
 from .region import FLIPPED_AXES, find_box, likely_misreading
 from .staging import staged
 from .trouble import Thumbnail, find_trouble
+from .turned import with_turned_masks
+from .white import FULL, ignored_white_of, white_of
 from .workspace import Progress
 from .writer import clipping_depths, scene_xml, sensors_xml, write_known, write_record, write_target
 
 #: An object farther from the origin than so many of its sizes is moved there.
 _FAR = 50.0
-#: Masks whose largest coverage is less do not reach white; a rounded one may miss it by a little.
-_FAINT_MASK = 0.95
 
 
 @dataclass(frozen=True)
@@ -121,10 +121,17 @@ class _Import:
         self.capture = replace(capture, frames=tuple(
             replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames))
         gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
-        self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains)
+        given = background is None and "masks" not in self.made
+        white = white_of(self.capture.frames) if given else 1.0
+        self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains,
+                                       white, ignored_white_of(self.capture.frames))
         self.warnings = [*capture.notes, *_profile_warning(capture, config)]
-        if "masks" not in self.made:
-            self.warnings += _turned_warning(capture)
+        if white < 1:
+            self.warnings.append(f"The largest value of the masks is {255 * white:.3g} of 255 ({white:.2g}); "
+                                 f"it is taken for white, which is 1.")
+        if given:
+            self.capture, turned = with_turned_masks(self.capture, white, config.invert_masks)
+            self.warnings += turned
         self.cameras: dict[str, Camera] = {}
         self.tests: dict[str, Camera] = {}
         self.thumbnails: list[Thumbnail] = []
@@ -168,7 +175,7 @@ class _Import:
             if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
                 empty.append(frame.image.name)    # it would carve away everything that it frames
                 continue
-            if target.covered < _FAINT_MASK:
+            if target.covered < FULL:
                 faint[frame.image.name] = target.covered
             name = f"test_{len(self.tests):03}" if frame.held_out else f"view_{len(self.cameras):03}"
             place = folder / "test" if frame.held_out else folder
@@ -194,7 +201,8 @@ class _Import:
             self.warnings.append(f"{len(empty)} {what} left out: {some}.")
         if faint:
             some = ", ".join(f"{name} ({share:.2f})" for name, share in list(faint.items())[:3])
-            self.warnings.append(f"{counted(len(faint), 'mask')} nowhere reach full coverage; the largest is "
+            self.warnings.append(f"{counted(len(faint), 'mask')} nowhere "
+                                 f"{'reaches' if len(faint) == 1 else 'reach'} full coverage; the largest is "
                                  f"{some}{' ...' if len(faint) > 3 else ''}: the object counts as half "
                                  f"transparent; write masks that are white (255, 1.0) on the object.")
 
@@ -207,6 +215,8 @@ class _Import:
             turned = self.to_scene[:3, :3] @ region.mean(axis=0)
             region = _cube(region) - region.mean(axis=0) + turned
         box = find_box(silhouettes, region)
+        if box is None and region is not None:    # such as a unit sphere that nobody has fitted to the object
+            box = find_box(silhouettes)
         if box is None:
             misreading = likely_misreading(silhouettes, self.to_scene)
             cure = "check the masks and cameras, or give --box and look at the picture of --check"
@@ -273,20 +283,6 @@ def _profile_warning(capture: Capture, config: CaptureConfig) -> list[str]:
         return []
     return [f"The photographs carry the colour profile '{profile}', but are read as sRGB: name their colour "
             f"space with --color-space."]
-
-
-def _turned_warning(capture: Capture) -> list[str]:
-    """If masks may be turned against photographs with an EXIF orientation, which their sizes do not tell."""
-    turned = [frame for frame in capture.frames
-              if frame.mask is not None and _is_ambiguous(exif_orientation(frame.image), frame.camera)]
-    if not turned:
-        return []
-    return [f"{counted(len(turned), 'photograph')} such as {turned[0].image.name} carry an EXIF orientation: "
-            f"their masks must be stored as their pixels are, not as viewers turn them."]
-
-
-def _is_ambiguous(orientation: int, camera: Camera) -> bool:
-    return orientation in (2, 3, 4) or (orientation > 4 and camera.width == camera.height)
 
 
 def to_scene(capture: Capture, up: str) -> np.ndarray:

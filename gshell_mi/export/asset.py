@@ -79,13 +79,13 @@ def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
     names = ["mesh.glb", *(_OBJ_FILES if config.obj else ())]
     if config.remesh is not None:
         names.append("remeshed.ply")
+    turn = y_up_turn(folder)    # all is read before anything is written
     with own_folder(folder, "fit") as own:
         own.claim(*names)
-        return _write(folder, fine, config)
+        return _write(folder, fine, turn, config)
 
 
-def _write(folder: Path, fine: FittedMesh, config: AssetConfig) -> dict:
-    turn = y_up_turn(folder)
+def _write(folder: Path, fine: FittedMesh, turn: np.ndarray, config: AssetConfig) -> dict:
     fine = FittedMesh(fine.vertices @ turn.T, fine.faces, fine.normals @ turn.T, fine.attributes)
     vertices, faces = _simplified(fine, config.face_count)
     atlas = unwrap(vertices, faces, texture_size=config.texture_size, seconds=config.unwrap_seconds)

@@ -88,6 +88,8 @@ def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: s
             folder.check(scene_inputs(scene) | loaded.target_files, fit.views.ids)
         if not fit.pixels.has_alpha:
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
+        for note in loaded.notes:
+            progress.warn(note)
         # Nothing is written before all is known to be in order.
         folder.prepare()
         if observer:

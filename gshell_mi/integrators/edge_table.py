@@ -79,7 +79,7 @@ class EdgeTable:
     end: mi.UInt32    #: 3F: second vertex
     edge: mi.UInt32   #: 3F: representative directed edge
     forward: mi.Bool  #: 3F: whether it runs from the lower to the higher welded vertex
-    valid: mi.Bool    #: 3F: false for the edges of degenerate faces
+    valid: mi.Bool    #: 3F: false for the edges of degenerate and of repeated faces
     split: mi.Bool    #: 3F: its faces have different copies of an end point (at representatives)
     degree: mi.Int32  #: 3F: number of faces at the edge, stored at its representative
 
@@ -88,7 +88,9 @@ def build_edge_table(positions: mi.Float, faces: mi.UInt32) -> EdgeTable:
     """The edges of a mesh, vertices at exactly the same position counting as one.
 
     Welding by position keeps texture seams from looking like open boundaries. Faces with two equal
-    (welded) corners are left out, so padding by degenerate faces is free.
+    (welded) corners are left out, so padding by degenerate faces is free, and so are faces whose
+    corners are those of an earlier one, on whatever side: they would hide that an edge is open or a
+    crease.
 
     Args:
         positions: ``Float``, 3V, interleaved.
@@ -115,9 +117,8 @@ def build_edge_table(positions: mi.Float, faces: mi.UInt32) -> EdgeTable:
     side = corner - 3 * face
     start = dr.gather(mi.UInt32, faces, corner)
     end = dr.gather(mi.UInt32, faces, 3 * face + dr.select(side == 2, 0, side + 1))
-    opposite = dr.gather(mi.UInt32, faces, 3 * face + dr.select(side == 0, 2, side - 1))
-    a, b, c = (dr.gather(mi.UInt32, welded, v) for v in (start, end, opposite))
-    valid = (a != b) & (b != c) & (c != a)
+    a, b = (dr.gather(mi.UInt32, welded, v) for v in (start, end))
+    valid = dr.gather(mi.UInt32, _first_with_equal_corners(welded, faces), face) == face
     forward = a < b
     edge = first_with_equal_key([dr.minimum(a, b), dr.maximum(a, b)], valid)
 
@@ -128,6 +129,14 @@ def build_edge_table(positions: mi.Float, faces: mi.UInt32) -> EdgeTable:
     split = copies != (start + end) * mi.UInt32(degree)
     dr.eval(start, end, edge, forward, valid, split, degree)
     return EdgeTable(start, end, edge, forward, valid, split, degree)
+
+
+def _first_with_equal_corners(welded: mi.UInt32, faces: mi.UInt32) -> mi.UInt32:
+    """For each face the first one with the same welded corners, in any order; 0xFFFFFFFF if two are equal."""
+    face = dr.arange(mi.UInt32, dr.width(faces) // 3)
+    a, b, c = (dr.gather(mi.UInt32, welded, dr.gather(mi.UInt32, faces, 3 * face + k)) for k in range(3))
+    low, high = dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))
+    return first_with_equal_key([low, a ^ b ^ c ^ low ^ high, high], (a != b) & (b != c) & (c != a))
 
 
 def scene_edge_tables(scene: mi.Scene) -> list[tuple[mi.Mesh, EdgeTable]]:

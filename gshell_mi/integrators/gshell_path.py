@@ -38,9 +38,10 @@ class GShellPathIntegrator(ADIntegrator):
       false): as for ``prb``.
     * ``gradient_depth`` (int, default ``max_depth``): derivatives are those of the image with this
       ``max_depth``. What longer paths add to the image counts as constant, which spares time.
-    * ``reparam_depth`` (int, default 1): how many segments of a path may lose sight of what they see:
-      1 the camera's, 2 also what the first surface receives, 3 also what the second one does. Shadows
-      need 2; fits of whole objects do as well without, in less time (``docs/gradients.md``).
+    * ``reparam_depth`` (int, default 3): how many segments of a path may lose sight of what they see:
+      1 the camera's, 2 also what the first surface receives, 3 also what the second one does. Below
+      ``gradient_depth``, derivatives lack those of moving shadows, for less time
+      (``docs/gradients.md``).
     * ``warp_radius`` (float, default 2 pixels): how far the warp reaches around a silhouette.
     * ``light_edge_samples`` (float, default 1): samples of shadow boundaries per pixel of the film.
     * ``crease_angle`` (float, default 0.1 degrees): edges of flat-shaded meshes above it count as
@@ -65,7 +66,7 @@ class GShellPathIntegrator(ADIntegrator):
         if gradient_depth < 1:
             raise UserError(f"gshell_path: gradient_depth is {gradient_depth}, but has to be at least 1.")
         self.gradient_depth: int = min(gradient_depth, self.max_depth)
-        self.reparam_depth = props.get("reparam_depth", 1)
+        self.reparam_depth = props.get("reparam_depth", 3)
         if self.reparam_depth not in (1, 2, 3):
             raise UserError(f"gshell_path: reparam_depth is {self.reparam_depth}, but has to be 1, 2 or 3.")
         self.said = set()   # warnings given so far

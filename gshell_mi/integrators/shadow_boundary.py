@@ -111,7 +111,7 @@ class _Boundary:
 
     def term(self, drawn: ShadowSamples, bounce: int, samples: int,
              sampler: mi.Sampler) -> BoundaryTerm | None:
-        """The boundary term of drawn edge samples, or ``None`` if none of them is seen."""
+        """The boundary term of drawn edge samples, or ``None`` if none of them is seen or nothing moves."""
         indirect = drawn.emitter is None and not bounce and self.integrator.gradient_depth > 2
         cast, outward, importance = self._importance(drawn, bounce, indirect)
         offset = sampler.next_1d()
@@ -128,6 +128,8 @@ class _Boundary:
         with dr.resume_grad():
             followed = self.curves.follow(self.wedges.positions, drawn, cast, outward, bounce)
             moving = project_to_film(self.sensor, followed.visible)
+            if not dr.grad_enabled(moving):    # as where only materials and lights are sought
+                return None
         tangent, _, side = self.curves.film_vectors(followed)
         scattered, radiance, ok = self._reflected(drawn, cast, followed, bounce)
         lit, dark = self.curves.rays(drawn, cast, followed, outward)

@@ -2,96 +2,34 @@
 
 from __future__ import annotations
 
-import io
-import shutil
 import sys
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from random import Random
 
 import mitsuba as mi
 import numpy as np
 import trimesh
 
-from gshell_mi.errors import UserError
-
-from .mutators import damage_file
+from .fits import (
+    compare,
+    damage_state,
+    export,
+    film,
+    load_checkpoint,
+    report,
+    resume,
+    write_checkpoint,
+    write_fit_to_export,
+    write_fit_with_targets,
+    write_reported_fit,
+    write_started_fit,
+)
+from .target import Target, command
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "capture"))
 
 _VIEWS = 5
-
-
-class Broken(Exception):
-    """What must not happen has happened, short of a crash."""
-
-
-class Target:
-    """Something that reads files.
-
-    Args:
-        write: makes good inputs in a folder.
-        attempt: reads them; raises nothing but ``UserError``.
-        files: patterns of those that are damaged.
-    """
-
-    def __init__(self, write: Callable[[Path], object], attempt: Callable[[Path], object], *files: str):
-        self._write, self._attempt, self._files = write, attempt, files
-
-    def prepare(self, folder: Path) -> None:
-        """Writes the good inputs, and checks that they are good."""
-        folder.mkdir(parents=True)
-        self._write(folder)
-        self._attempt(self._copy(folder, folder.parent / "good"))
-
-    def try_one(self, folder: Path, seed: str) -> str:
-        """Tries a damaged copy of the inputs in ``folder``; "ok" or "refused".
-
-        Raises:
-            Exception: whatever should not have happened.
-        """
-        random = Random(seed)
-        place = self._copy(folder, folder.parent / "try")
-        candidates = sorted(path for pattern in self._files for path in place.rglob(pattern))
-        damaged = random.choice(candidates)
-        damage_file(damaged, random)
-        before = _tree(place.parent)
-        try:
-            self._attempt(place)
-        except UserError as error:
-            if not str(error).strip() or "Traceback" in str(error):
-                raise Broken(f"no sentence: {error}") from error
-            left = _tree(place.parent) - before
-            if left:
-                raise Broken(f"left behind after a refusal: {sorted(left)[:3]}") from error
-            return "refused"
-        outside = {path for path in _tree(place.parent) - before if not path.startswith("try/out")}
-        if outside:
-            raise Broken(f"written outside of the output: {sorted(outside)[:3]}")
-        return "ok"
-
-    @staticmethod
-    def _copy(source: Path, goal: Path) -> Path:
-        shutil.rmtree(goal, ignore_errors=True)
-        shutil.copytree(source, goal)
-        return goal
-
-
-def _tree(folder: Path) -> set[str]:
-    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
-
-
-def _command(main: Callable[[list[str]], int], *arguments: object) -> None:
-    """Runs a command in this process; ``UserError`` with what it told if it refuses."""
-    told = io.StringIO()
-    with redirect_stderr(told), redirect_stdout(io.StringIO()):
-        code = main([*map(str, arguments)])
-    if code == 2:
-        raise UserError(told.getvalue())
-    if code != 0:
-        raise Broken(f"exit code {code}: {told.getvalue()}")
 
 
 def _cameras() -> list:
@@ -113,7 +51,40 @@ def _capture(writer: str, *options) -> Callable[[Path], object]:
 def _import(folder: Path) -> None:
     from gshell_mi.capture.__main__ import main
 
-    _command(main, folder / "source", "-o", folder / "out.xml", "--quiet", "--resolution", "8")
+    command(main, folder / "source", "-o", folder / "out.xml", "--quiet", "--resolution", "8")
+
+
+def _ignoring(folder: Path) -> None:
+    """A capture with files of masks and ignore masks."""
+    from PIL import Image
+
+    _capture("write_colmap", "PINHOLE", False)(folder)
+    (folder / "source" / "ignore").mkdir()
+    for number, image in enumerate(sorted((folder / "source" / "images").iterdir())):
+        ignored = np.zeros((12, 16), np.uint8)
+        ignored[:, :number] = 255
+        Image.fromarray(ignored).save(folder / "source" / "ignore" / f"{image.stem}.png")
+
+
+def _video(suffix: str) -> Callable[[Path], object]:
+    def write(folder: Path) -> None:
+        import imageio_ffmpeg
+
+        codec = "mpeg4" if suffix == "avi" else "libx264"
+        writer = imageio_ffmpeg.write_frames(str(folder / f"clip.{suffix}"), (32, 32), fps=8, codec=codec)
+        writer.send(None)
+        for frame in np.random.default_rng(0).integers(0, 255, (8, 32, 32, 3), np.uint8):
+            writer.send(frame.tobytes())
+        writer.close()
+
+    return write
+
+
+def _cut(folder: Path) -> None:
+    from gshell_mi.capture.video import cut
+    from gshell_mi.capture.workspace import Workspace
+
+    cut(next(folder.glob("clip.*")), Workspace(folder / "out.work"), 3)
 
 
 def _images(folder: Path) -> None:
@@ -154,6 +125,15 @@ def _scene(folder: Path) -> None:
         bitmap.write(str(folder / "bowl" / f"view_{number:03}.exr"))
 
 
+def _known(folder: Path) -> None:
+    """A scene whose targets have depth maps and files of what is known."""
+    _scene(folder)
+    for number in range(12):
+        for kind, value in (("known", 1.0), ("depth", 2.0)):
+            bitmap = mi.Bitmap(np.full((8, 8, 1), value, np.float32), mi.Bitmap.PixelFormat.Y)
+            bitmap.write(str(folder / "bowl" / f"view_{number:03}.{kind}.exr"))
+
+
 def _load_scene(folder: Path) -> None:
     from gshell_mi.scene import load_fit_scene
 
@@ -183,36 +163,6 @@ def _score(folder: Path) -> None:
     mesh_scores(read_mesh(next(folder.glob("mesh.*"))), reference, samples=500)
 
 
-def _fit(folder: Path) -> None:
-    from fitted import open_sphere, write_fit
-
-    from gshell_mi.files import replacing
-
-    write_fit(folder, open_sphere(2), views=2, size=8)
-    with replacing(folder / "metrics.json") as partial:
-        partial.write_text('{"targets": "targets", "scene": "a.xml"}', encoding="utf-8")
-
-
-def _turntable(folder: Path) -> None:
-    from gshell_mi.turntable import TurntableConfig, render_turntable
-
-    for _ in render_turntable(folder, TurntableConfig(frames=1, size=8, spp=1, max_depth=2, denoise=False)):
-        pass
-
-
-def _export(folder: Path) -> None:
-    from gshell_mi.export.asset import AssetConfig, write_asset
-
-    (folder / "out").mkdir()
-    for name in ("mesh.ply", "scene.xml", "light.exr"):
-        shutil.copy(folder / name, folder / "out")
-    try:
-        write_asset(folder / "out", AssetConfig(texture_size=16, unwrap_seconds=5))
-    except UserError:
-        shutil.rmtree(folder / "out")    # the copy is the test's
-        raise
-
-
 def _fields(folder: Path) -> None:
     from gshell_mi.fields import sphere
     from gshell_mi.lattice import TetLattice
@@ -232,19 +182,6 @@ def _extract(folder: Path) -> None:
 
     fields = LatticeFields.load(folder / "fields.npz")
     assert fields.lattice.vertex_count == fields.sdf.size
-
-
-def _checkpoint(folder: Path) -> None:
-    from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
-
-    Checkpoint(stage="joint", iteration=3, config={}, seconds={}, arrays={"a": np.ones(4, np.float32)}).save(
-        folder / "checkpoint.npz")
-
-
-def _resume(folder: Path) -> None:
-    from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
-
-    Checkpoint.load(folder / "checkpoint.npz")
 
 
 def _map(folder: Path) -> None:
@@ -272,10 +209,20 @@ TARGETS = {
        for suffix in ("ply", "obj", "stl", "glb", "off")},
     "closed_mesh": Target(_mesh("ply", open_at=9.0), _convert, "mesh.*"),
     "scores": Target(_mesh("ply"), _score, "mesh.*"),
-    "turntable": Target(_fit, _turntable, "mesh.ply", "scene.xml", "light.exr"),
-    "export": Target(_fit, _export, "mesh.ply", "scene.xml"),
+    "masks": Target(_ignoring, _import, "masks/*.png", "ignore/*.png"),
+    "known": Target(_known, _load_scene, "*.known.exr", "*.depth.exr"),
+    **{f"video_{suffix}": Target(_video(suffix), _cut, "clip.*", keeps="out.work")
+       for suffix in ("mp4", "avi", "mkv")},
+    "turntable": Target(write_fit_with_targets, film, "mesh.ply", "scene.xml", "light.exr"),
+    "compare": Target(write_fit_with_targets, compare, "mesh.ply", "template.ply", "scene.xml", "light.exr",
+                      "view_*.exr", keeps="out_errors"),
+    "export": Target(write_fit_to_export, export, "mesh.ply", "scene.xml", "light.exr"),
+    "report": Target(write_reported_fit, report, "metrics.json", "log.jsonl", "scene.xml", "light.exr",
+                     "mesh.glb", "mesh.ply", "view_*.png"),
     "fields": Target(_fields, _extract, "*.npz"),
     "block_fields": Target(_block_fields, _extract, "*.npz"),
-    "checkpoint": Target(_checkpoint, _resume, "*.npz"),
+    "checkpoint": Target(write_checkpoint, load_checkpoint, "*.npz"),
+    "resume": Target(write_started_fit, resume, "out/checkpoint.npz", "out/log.jsonl", "out/gshell_mi.json",
+                     keeps="out/", damage=damage_state),
     "light": Target(_map, _light, "map.*"),
 }

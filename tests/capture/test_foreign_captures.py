@@ -7,7 +7,15 @@ import shutil
 import mitsuba as mi
 import numpy as np
 import pytest
-from known_capture import known_cameras, straight_png, write_colmap, write_nerf
+from known_capture import (
+    BALL,
+    RADIUS,
+    known_cameras,
+    straight_png,
+    write_colmap,
+    write_idr,
+    write_nerf,
+)
 from PIL import Image, ImageOps
 
 from gshell_mi.capture import CaptureConfig, read_capture
@@ -18,7 +26,9 @@ from gshell_mi.capture.formats import colmap
 from gshell_mi.capture.frames import Frame
 from gshell_mi.capture.masks import assign_masks, coverage_of
 from gshell_mi.capture.run import import_capture
+from gshell_mi.capture.white import ignored_white_of, white_of
 from gshell_mi.errors import UserError
+from gshell_mi.scene import load_fit_scene
 
 CAMERAS = known_cameras(8, width=16, height=12, fx=20.0, fy=20.0, cx=8.0, cy=6.0)
 
@@ -252,17 +262,147 @@ def test_masks_that_were_turned_as_exif_tells(orientation, larger, tmp_path):
     np.testing.assert_allclose(found, values / 255, atol=1e-6)
 
 
-def test_grey_masks_are_told(nerf, tmp_path):
-    def edit(document):
-        for frame in document["frames"]:
-            rgba = np.array(Image.open(nerf / frame["file_path"]))
-            rgba[..., 3] = rgba[..., 3] // 4 * 3
-            Image.fromarray(rgba).save(nerf / frame["file_path"])
+@pytest.mark.parametrize("follow", [True, False])
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_masks_that_were_turned_though_sizes_do_not_tell(orientation, follow, tmp_path):
+    """Photographs upside down or square, with masks of a tool that honours their EXIF orientation or not."""
+    width = 18 if orientation == 6 else 24
+    cameras = known_cameras(8, width=width, height=18, fx=20.0, fy=20.0, cx=width - 5.0, cy=5.5)
+    write_colmap(tmp_path / "set", cameras, binary=False)
+    model = tmp_path / "set" / "sparse" / "0" / "images.txt"
+    model.write_text(model.read_text().replace(".png", ".webp"))
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    images, masks = (sorted((tmp_path / "set" / name).iterdir()) for name in ("images", "masks"))
+    for image, mask in zip(images, masks, strict=True):
+        Image.open(image).save(image.with_suffix(".webp"), exif=exif, lossless=True)
+        stored = Image.open(mask)
+        stored.load()
+        if follow:
+            stored.getexif()[0x112] = orientation
+            stored = ImageOps.exif_transpose(stored)
+        stored.save(mask.with_name(image.name))
+        image.unlink()
+        mask.unlink()
+    result = import_capture(tmp_path / "set", tmp_path / "a.xml", config=CaptureConfig(resolution=8))
+    assert any("the masks are turned back" in warning for warning in result.warnings) == follow
+    for target, camera in zip(load_fit_scene(result.path).targets, cameras, strict=True):
+        np.testing.assert_allclose(target.rgba[..., 3], camera.render()[..., 3], atol=0.01)
 
-    change(nerf, edit)
+
+def rescaled_alpha(nerf, level):
+    """Gives the alpha of each frame's image another largest value; ``level`` of the frame's number."""
+    document = json.loads((nerf / "transforms.json").read_text(encoding="utf-8"))
+    for number, frame in enumerate(document["frames"]):
+        rgba = np.array(Image.open(nerf / frame["file_path"]))
+        rgba[..., 3] = np.round(rgba[..., 3] / 255.0 * level(number))
+        Image.fromarray(rgba).save(nerf / frame["file_path"])
+
+
+def largest_coverage(result):
+    """The largest alpha of each training target."""
+    return [target.rgba[..., 3].max() for target in load_fit_scene(result.path).targets]
+
+
+@pytest.mark.parametrize("level", [200, 128, 1])
+def test_masks_of_another_white_are_stretched(level, nerf, tmp_path):
+    rescaled_alpha(nerf, lambda number: level)
     result = import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(resolution=8))
-    told = [warning for warning in result.warnings if "nowhere reach full coverage" in warning]
-    assert told and told[0].startswith("8 masks") and "frame_00000.png (0.74)" in told[0]
+    np.testing.assert_allclose(largest_coverage(result), 1, atol=1e-3)
+    assert any(f"masks is {level} of 255" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_mask_files_of_another_white_are_stretched(inverted, tmp_path):
+    values = np.zeros((6, 8), np.uint8)
+    values[2:4, 2:6] = 128
+    if inverted:
+        values = 128 - values
+    Image.fromarray(values).save(tmp_path / "mask.png")
+    frame = Frame(tmp_path / "a.png", Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4)), tmp_path / "mask.png",
+                  ignored=tmp_path / "mask.png")
+    white = white_of([frame] * 3)
+    assert white == ignored_white_of([frame]) == pytest.approx(128 / 255)
+    found = coverage_of(frame, np.zeros((6, 8, 3), np.uint8), inverted=inverted, white=white)
+    expected = np.zeros((6, 8))
+    expected[2:4, 2:6] = 1
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(read_ignored(frame, (6, 8), 1, white), abs(expected - inverted), atol=1e-6)
+
+
+def test_masks_that_disagree_or_are_feathered_are_as_they_are(tmp_path):
+    frames = []
+    fade = np.round(200 * np.exp(-((np.arange(64) - 32) / 12.0) ** 2))
+    for name, values in (("full", [0, 255]), ("faint", [0, 200]), ("fainter", [0, 90]), ("feathered", fade)):
+        Image.fromarray(np.outer(np.ones(8), values).astype(np.uint8)).save(tmp_path / f"{name}.png")
+        frames.append(Frame(tmp_path / "a.png", Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4)),
+                            tmp_path / f"{name}.png"))
+    full, faint, fainter, feathered = frames
+    assert white_of([faint, full]) == white_of([faint, fainter]) == white_of([feathered] * 2) == 1
+
+
+def test_one_faint_mask_is_told(nerf, tmp_path):
+    rescaled_alpha(nerf, lambda number: 191 if number == 0 else 255)
+    result = import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(resolution=8))
+    told = [warning for warning in result.warnings if "nowhere" in warning]
+    assert told and told[0].startswith("1 mask ") and "frame_00000.png (0.75)" in told[0]
+    assert largest_coverage(result)[0] == pytest.approx(191 / 255, abs=1e-3)
+
+
+# --- cameras
+
+
+def idr_arrays(folder, edit):
+    """Changes the arrays of an IDR capture, written anew; returns its folder."""
+    write_idr(folder, CAMERAS)
+    with np.load(folder / "cameras_sphere.npz") as stored:
+        arrays = dict(stored)
+    for index, camera in enumerate(CAMERAS):
+        edit(arrays, index, camera)
+    np.savez(folder / "cameras_sphere.npz", **arrays)
+    return folder
+
+
+def pose_alone(arrays, index, camera):
+    to_camera = np.stack([camera.right, -camera.up, camera.forward])
+    arrays[f"world_mat_{index}"] = np.vstack([np.column_stack([to_camera, -to_camera @ camera.origin]),
+                                              [0, 0, 0, 1]])
+
+
+def test_poses_with_intrinsics_of_their_own(tmp_path):
+    """As in DVR's cameras.npz."""
+    def edit(arrays, index, camera):
+        pose_alone(arrays, index, camera)
+        arrays[f"camera_mat_{index}"] = np.diag([2 * camera.fx / camera.width, 2 * camera.fy / camera.height,
+                                                 1.0, 1.0])
+
+    capture = read_capture(idr_arrays(tmp_path, edit))
+    for frame, camera in zip(capture.frames, CAMERAS, strict=True):
+        found = frame.camera
+        assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx(
+            (camera.fx, camera.fy, camera.cx, camera.cy))
+        np.testing.assert_allclose(found.center, camera.origin, atol=1e-9)
+        np.testing.assert_allclose(found.forward, camera.forward, atol=1e-9)
+
+
+def test_poses_without_intrinsics_are_told(tmp_path):
+    with pytest.raises(UserError, match=r"camera 0 of .* is a pose without a focal length"):
+        read_capture(idr_arrays(tmp_path, pose_alone))
+
+
+def test_a_unit_sphere_that_nobody_has_fitted(tmp_path):
+    """The world is in other units and off the origin, and scale_mat is the identity."""
+    def edit(arrays, index, camera):
+        moved = np.diag([0.01, 0.01, 0.01, 1.0])
+        moved[:3, 3] = [-3, -4, -5]
+        arrays[f"world_mat_{index}"] = arrays[f"world_mat_{index}"] @ moved
+        arrays[f"scale_mat_{index}"] = np.eye(4)
+
+    folder = idr_arrays(tmp_path / "set", edit)
+    result = import_capture(folder, tmp_path / "a.xml", config=CaptureConfig(resolution=8, up="keep"))
+    center = (BALL + np.array([3, 4, 5])) * 100
+    np.testing.assert_allclose(result.box.mean(axis=0), center, atol=10)
+    assert 200 * RADIUS < np.ptp(result.box, axis=0).max() < 300 * RADIUS    # masks are of few pixels
 
 
 # --- what is written

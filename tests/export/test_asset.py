@@ -249,3 +249,12 @@ def test_empty_mesh(tmp_path):
     write_fit(tmp_path, empty)
     with pytest.raises(UserError, match="is empty; there is nothing to export"):
         write_asset(tmp_path)
+
+
+def test_a_damaged_scene_leaves_nothing_behind(tmp_path):
+    write_fit(tmp_path, open_sphere(2), views=1)
+    (tmp_path / "scene.xml").write_text("<scene")
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(UserError, match=r"scene\.xml' cannot be loaded"):
+        write_asset(tmp_path)
+    assert sorted(tmp_path.iterdir()) == before

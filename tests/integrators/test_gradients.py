@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 
 from gshell_mi.errors import UserError
 from pipelines import gradient_scenes as scenes
@@ -18,8 +19,7 @@ QUICK = ["sphere_translating", "sheet_scaling", "sharp_pleats", "cube_flat_shade
 
 
 def path(case, **options):
-    return mi.load_dict({"type": "gshell_path", "max_depth": case.depth, "reparam_depth": case.depth,
-                         "hide_emitters": True, **options})
+    return mi.load_dict({"type": "gshell_path", "max_depth": case.depth, "hide_emitters": True, **options})
 
 
 def weighted(images):
@@ -138,6 +138,24 @@ def test_edges_in_line_with_the_light_cast_one_shadow():
     two = shadow_of_a_curtain([(-0.05, 1.5), (0, 1), (-1.2e-4, 0.97), (-3e-5, 0.94), (-1, 0.6)])
     assert one != 0
     assert two == pytest.approx(one, rel=0.02)
+
+
+@pytest.mark.parametrize("copies", [False, True])
+def test_repeated_faces_change_no_derivative(copies):
+    """Whose creases and silhouettes are there twice."""
+    def derivative(doubled):
+        box = trimesh.creation.box((1.2, 1.2, 1.2))
+        v, f = np.array(box.vertices), np.array(box.faces)
+        if doubled:
+            again, v = (f + len(v), np.concatenate([v, v])) if copies else (f[:, ::-1], v)
+            f = np.concatenate([f, again])
+        case = scenes.GradientScene("cube", "", lambda _: (
+            scenes.load(scenes.camera(RESOLUTION, (2, 2.5, 4)), scenes.sky(),
+                        scenes.make_mesh("subject", v, f, smooth=False)), scenes.translation(v)))
+        mover = scenes.Mover(case, RESOLUTION)
+        return weighted([scenes.forward_image(mover, path(case), 16, seed) for seed in range(4)]).mean()
+
+    assert derivative(True) == pytest.approx(derivative(False), rel=0.02)
 
 
 def test_alpha_of_a_scaled_sphere():

@@ -42,6 +42,17 @@ def test_padding_is_ignored():
     assert open_edges(v, padded) == open_edges(v, f)
 
 
+@pytest.mark.parametrize("turn", [[0, 1, 2], [1, 2, 0], [0, 2, 1]])
+@pytest.mark.parametrize("mesh", [scenes.sphere(1), scenes.open_cylinder(8, 2)])
+def test_repeated_faces_change_nothing(mesh, turn):
+    """Whatever their side, with the same vertices or with copies of their own."""
+    v, f = mesh
+    again = f[:, turn]
+    doubled = open_edges(v, np.concatenate([f, again]))
+    copied = open_edges(np.concatenate([v, v]), np.concatenate([f, again + len(v)]))
+    assert doubled == copied == open_edges(v, f)
+
+
 def test_silhouette_does_not_depend_on_orientation():
     v, f = scenes.sphere(2)
     flipped = f.copy()

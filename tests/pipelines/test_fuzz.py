@@ -17,7 +17,8 @@ from fuzzing.mutators import damage_file
 
 #: A few of each; some hundred inputs in ten seconds.
 QUICK = {"nerf": 12, "colmap_text": 12, "llff": 12, "images": 8, "scene": 6, "mesh_ply": 8, "mesh_obj": 8,
-         "scores": 12, "fields": 40, "block_fields": 20, "light": 12}
+         "scores": 12, "fields": 40, "block_fields": 20, "light": 12, "masks": 8, "known": 8, "video_mp4": 6,
+         "compare": 8, "export": 6}
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -40,6 +41,11 @@ def leave(folder):
     refuse(folder)
 
 
+def cut_short(folder):
+    (folder / "out").mkdir()
+    (folder / "out" / ".mesh.partial").write_text("half")
+
+
 def stray(folder):
     (folder.parent / "b.txt").write_text("elsewhere")
 
@@ -52,6 +58,7 @@ def first_well(then):
 @pytest.mark.parametrize("attempt, outcome", [
     (lambda folder: None, "ok"), (refuse, "refused"), (lambda folder: 1 / 0, "failed ZeroDivisionError"),
     (leave, "failed Broken: left behind after a refusal"), (stray, "failed Broken: written outside"),
+    (cut_short, "failed Broken: half-written"),
 ])
 def test_what_counts_as_a_failure(attempt, outcome, tmp_path, monkeypatch):
     monkeypatch.setitem(targets.TARGETS, "one", target(first_well(attempt)))
@@ -59,9 +66,8 @@ def test_what_counts_as_a_failure(attempt, outcome, tmp_path, monkeypatch):
     assert fuzz.attempt("one", tmp_path / "inputs", 0, 0).startswith(outcome)
 
 
-def test_crashes_and_hangs_are_seen(monkeypatch):
+def test_crashes_and_hangs_are_seen():
     """A worker that dies and one that stops, in place of the real ones."""
-    monkeypatch.setattr(fuzz, "LIMIT", 1.0)
     findings = fuzz.Findings()
 
     def worker(program):
@@ -73,15 +79,32 @@ def test_crashes_and_hangs_are_seen(monkeypatch):
 
     process, reading = worker(r"os.write({}, b'ready\nok\nrefused\n'); os.kill(os.getpid(), signal.SIGSEGV)")
     with open(os.devnull, "rb") as said:
-        following, _ = fuzz._watch(process, reading, "a", 0, 60.0, findings, said)
+        following, _ = fuzz._watch(process, reading, "a", 0, 60.0, findings, said, 1.0)
     process, reading = worker(r"os.write({}, b'ready\nok\n'); time.sleep(60)")
     with open(os.devnull, "rb") as said:
-        fuzz._watch(process, reading, "b", 0, 60.0, findings, said)
+        fuzz._watch(process, reading, "b", 0, 60.0, findings, said, 1.0)
     process.kill()
     process.wait()
     assert following == 3
     assert findings.failures == ["a:2 ends the process with -11 (nothing said)", "b:1 takes more than 1 s"]
     assert findings.outcomes == {"a ok": 1, "a refused": 1, "b ok": 1}
+    assert {kind: count for kind, count in findings.counts().items() if count} == {"crashes": 1, "hangs": 1}
+
+
+def test_much_of_the_processors_is_a_hang(tmp_path, monkeypatch):
+    """Though the clock's limit is longer, as it is on a busy machine."""
+    def work_hard(folder):
+        while fuzz._processor_seconds() < end:
+            sum(range(10_000))
+
+    monkeypatch.setattr(fuzz, "LIMIT", 0.3)
+    monkeypatch.setitem(targets.TARGETS, "one", target(first_well(work_hard)))
+    end = fuzz._processor_seconds() + 0.6
+    reading, writing = os.pipe()
+    fuzz.work(writing, "one", 0, 0, 1, tmp_path)
+    assert os.read(reading, 100) == b"ready\nfailed takes 1 s of the processors\n"
+    os.close(reading)
+    os.close(writing)
 
 
 @pytest.mark.parametrize("name, content", [

@@ -1,7 +1,8 @@
 """IDR's and NeuS's ``cameras*.npz``: DTU, BlendedMVS and what follows them.
 
 ``world_mat_i`` is a projection ``K [R | t]`` from the world to pixels with integer centres (0, 0), and
-``scale_mat_i`` maps the unit sphere, which holds the object, to the world.
+``scale_mat_i`` maps the unit sphere, which holds the object, to the world. In DVR's files of the same names
+``world_mat_i`` is ``[R | t]`` alone, and ``camera_mat_i`` is ``K`` for an image from -1 to 1.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
             if unpacked > _LARGEST:
                 raise ValueError(f"it unpacks to {unpacked >> 20} MiB")
             arrays = {key: np.array(stored[key], dtype=np.float64) for key in stored.files
-                      if key.startswith(("world_mat_", "scale_mat_")) and "_inv" not in key}
+                      if key.startswith(("world_mat_", "scale_mat_", "camera_mat_")) and "_inv" not in key}
     except Exception as error:
         raise UserError(f"'{path}' cannot be read ({error}); copy or export it again.") from error
     count = sum(key.startswith("world_mat_") for key in arrays)
@@ -63,7 +64,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
     for index, image in enumerate(files):
         owner = f"camera {index} of '{path}'"
         world = arrays.get(f"world_mat_{index}", np.zeros(0))
-        frames.append(Frame(image, _camera(world, image, owner)))
+        frames.append(Frame(image, _camera(world, arrays.get(f"camera_mat_{index}"), image, owner)))
         scale = arrays.get(f"scale_mat_{index}")
         if scale is not None and scale.shape == (4, 4) and np.isfinite(scale).all():
             radius = np.linalg.norm(scale[:3, :3], axis=1)
@@ -72,10 +73,13 @@ def read(source: Path, images: Path | None = None) -> Capture:
     return Capture("IDR / NeuS", source, tuple(frames), region=region)
 
 
-def _camera(matrix: np.ndarray, image: Path, owner: str) -> Camera:
+def _camera(matrix: np.ndarray, intrinsic: np.ndarray | None, image: Path, owner: str) -> Camera:
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise UserError(f"The world_mat of {owner} is no finite 4 x 4 matrix; export the cameras again.")
+    size = image_size(image)
     projection = matrix[:3]
+    if np.allclose(projection[:, :3] @ projection[:, :3].T, np.eye(3), atol=1e-3):
+        projection = _to_pixels(intrinsic, size, owner) @ projection
     # A projection means the same with the opposite sign; depth is to grow forwards.
     projection = projection * np.sign(np.linalg.det(projection[:, :3]) or 1.0)
     intrinsic, rotation = rq(projection[:, :3])
@@ -89,7 +93,16 @@ def _camera(matrix: np.ndarray, image: Path, owner: str) -> Camera:
         raise UserError(f"The world_mat of {owner} has skewed pixels, which are not supported; resample its "
                         f"image.")
     pose = pose_of(np.concatenate([rotation.T, center[:, None]], axis=1), owner)
-    size = image_size(image)
     # Half a pixel: from integer centres to corners at integers.
     cx, cy = intrinsic[:2, 2] + 0.5
     return camera_for_image(Camera(*size, intrinsic[0, 0], intrinsic[1, 1], cx, cy, pose), size, image)
+
+
+def _to_pixels(intrinsic: np.ndarray | None, size: tuple[int, int], owner: str) -> np.ndarray:
+    """(3, 3) from camera axes to pixels with integer centres; ``camera_mat`` is for an image from -1 to 1."""
+    if intrinsic is None or intrinsic.shape not in ((3, 3), (4, 4)) or not np.isfinite(intrinsic).all():
+        raise UserError(f"The world_mat of {owner} is a pose without a focal length, and there is no finite "
+                        f"camera_mat with it; export the cameras as K [R | t].")
+    width, height = size
+    film = np.array([[width / 2, 0, (width - 1) / 2], [0, height / 2, (height - 1) / 2], [0, 0, 1]])
+    return film @ intrinsic[:3, :3]

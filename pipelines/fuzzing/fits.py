@@ -1,0 +1,168 @@
+"""Folders of fits, finished and begun, and what reads them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from random import Random
+
+import mitsuba as mi
+import numpy as np
+
+from gshell_mi.errors import UserError
+
+from .mutators import damage_file, damaged_array
+from .target import command
+
+
+def _finished(folder: Path) -> None:
+    from fitted import open_sphere, write_fit
+
+    write_fit(folder, open_sphere(2), views=2, size=8)
+    (folder / "metrics.json").write_text(json.dumps({
+        "scene": "a.xml", "targets": "targets", "psnr_training": 30.0, "psnr_per_view": {"view_000": 30.0},
+        "versions": {}, "config": {}, "seconds": {"total": 1.0}, "warnings": ["one"],
+        "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1}}), encoding="utf-8")
+
+
+def write_fit_with_targets(folder: Path) -> None:
+    """A finished fit and its targets."""
+    _finished(folder)
+    (folder / "targets").mkdir()
+    for number in range(2):
+        bitmap = mi.Bitmap(np.ones((8, 8, 4), np.float32), mi.Bitmap.PixelFormat.RGBA)
+        bitmap.write(str(folder / "targets" / f"view_{number:03}.exr"))
+
+
+def write_fit_to_export(folder: Path) -> None:
+    """A finished fit in a folder of its own, which is written into."""
+    (folder / "out").mkdir()
+    _finished(folder / "out")
+
+
+def write_reported_fit(folder: Path) -> None:
+    """A finished fit with all that its report shows."""
+    from PIL import Image
+
+    from gshell_mi.export.asset import AssetConfig, write_asset
+
+    (folder / "out" / "views").mkdir(parents=True)
+    _finished(folder / "out")
+    write_asset(folder / "out", AssetConfig(texture_size=16, unwrap_seconds=5))
+    (folder / "out" / "log.jsonl").write_text("".join(
+        json.dumps({"stage": stage, "iteration": number, "color": 1.0 / (number + 1), "psnr": 20.0,
+                    "seconds": 0.1}) + "\n" for stage in ("ghost", "joint") for number in range(3)))
+    for number in range(2):
+        Image.fromarray(np.zeros((8, 24, 3), np.uint8)).save(
+            folder / "out" / "views" / f"view_{number:03}.png")
+
+
+def film(folder: Path) -> None:
+    """One frame of a turntable."""
+    from gshell_mi.turntable import TurntableConfig, render_turntable
+
+    for _ in render_turntable(folder, TurntableConfig(frames=1, size=8, spp=1, max_depth=2, denoise=False)):
+        pass
+
+
+def compare(folder: Path) -> None:
+    """The command, images and mesh."""
+    from gshell_mi.compare.__main__ import main
+
+    command(main, folder, "--targets", folder / "targets", "--mesh", folder / "template.ply",
+            "--spp", "1", "--json", folder / "out.json", "-o", folder / "out_errors")
+
+
+def export(folder: Path) -> None:
+    """``mesh.glb``."""
+    from gshell_mi.export.asset import AssetConfig, write_asset
+
+    write_asset(folder / "out", AssetConfig(texture_size=16, unwrap_seconds=5))
+
+
+def report(folder: Path) -> None:
+    """The command."""
+    from gshell_mi.report.__main__ import main
+
+    command(main, folder / "out", "--turntable-frames", "1", "--turntable-size", "16", "--turntable-spp", "1")
+
+
+def write_checkpoint(folder: Path) -> None:
+    """A small checkpoint by itself."""
+    from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+
+    Checkpoint(stage="joint", iteration=3, config={}, seconds={}, arrays={"a": np.ones(4, np.float32)}).save(
+        folder / "checkpoint.npz")
+
+
+def load_checkpoint(folder: Path) -> None:
+    """Only reads it."""
+    from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+
+    Checkpoint.load(folder / "checkpoint.npz")
+
+
+class _Stopped(Exception):
+    pass
+
+
+class _Stop:
+    """Ends a fit in the middle of its joint stage, as a kill would, after a checkpoint."""
+
+    def begin(self, fit) -> None:
+        pass
+
+    def step(self, stage, iteration, count, values, preview) -> None:
+        if stage == "joint" and iteration > 0:
+            raise _Stopped
+
+
+def _short() -> list[str]:
+    from bowl import CLOSED, SHORT
+
+    return [*SHORT, *CLOSED, "--iterations", "2", "--triptychs", "1", "--checkpoint-seconds", "0"]
+
+
+def write_started_fit(folder: Path) -> None:
+    """A scene, and a fit of it that was stopped after the first step of its joint stage."""
+    import tyro
+    from bowl import write_fit_scene
+
+    from gshell_mi.fit import fit_scene
+    from gshell_mi.fit.config import FitConfig
+
+    scene = write_fit_scene(folder)
+    words = [word for word in _short() if word != "--no-report"]
+    config = tyro.cli(FitConfig, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+    try:
+        fit_scene(scene, folder / "out", config=config, report=False, quiet=True, observer=_Stop())
+    except _Stopped:
+        return
+    raise AssertionError("the fit has not come to its joint stage")
+
+
+def resume(folder: Path) -> None:
+    """The command, which has one step left."""
+    from gshell_mi.fit.__main__ import main
+
+    command(main, folder / "bowl.xml", "-o", folder / "out", "--resume", "--quiet", *_short())
+
+
+def damage_state(path: Path, random: Random) -> None:
+    """Damages a file, or values in a checkpoint that is a whole one otherwise."""
+    from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+
+    if path.suffix != ".npz" or random.random() < 0.5:
+        damage_file(path, random)
+        return
+    checkpoint = Checkpoint.load(path)
+    with np.errstate(all="ignore"):
+        if random.random() < 0.2:
+            checkpoint.iteration = random.choice((0, 2, 10**9))
+        else:
+            name = random.choice(sorted(checkpoint.arrays))
+            checkpoint.arrays[name] = damaged_array(checkpoint.arrays[name], random)
+    try:
+        checkpoint.save(path)
+    except (UserError, ValueError):
+        path.write_bytes(path.read_bytes()[:-1])
