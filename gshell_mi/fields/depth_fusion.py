@@ -9,14 +9,18 @@ import numpy as np
 from ..views import PinholeViews
 
 
+#: Levels between the truncations at which the views' distances are told apart.
+_LEVELS = 24
+
+
 def fused_distance(points: mi.Point3f, views: PinholeViews, depths: list[np.ndarray], *, truncation: float,
-                   votes: int) -> mi.Float:
+                   share: float) -> mi.Float:
     """Signed distance to what is not empty at ``points``, negative inside.
 
     Each view says how far a point lies before (positive) or behind (negative) what the view sees along the
-    ray to it; before it, space is empty. A point is as empty as ``votes`` views agree it is. Unlike a mean of
-    signed distances (Curless and Levoy, SIGGRAPH 1996), this keeps sheets that are seen from both sides: at
-    a sheet it is 0, and positive on both sides.
+    ray to it; before it, space is empty. Of the views that something nearer does not hide the point from, a
+    ``share`` has to say that it is empty. Unlike a mean of signed distances (Curless and Levoy, SIGGRAPH
+    1996) this keeps sheets that are seen from both sides: at a sheet it is 0, and positive on both sides.
 
     Args:
         points: positions in world units.
@@ -25,13 +29,15 @@ def fused_distance(points: mi.Point3f, views: PinholeViews, depths: list[np.ndar
             infinite where a view sees nothing, NaN where it is not known what it sees.
         truncation: largest size of a distance, world units. Neighbouring pixels whose depths differ by more
             belong to different surfaces; the nearer one counts for both.
-        votes: views that have to agree.
+        share: of the views that have to agree, in (0, 1).
 
     Returns:
-        One distance per point, world units. Where fewer views say anything it is ``-truncation``.
+        One distance per point, world units. Where no view says anything it is ``-truncation``.
     """
-    limit = dr.opaque(mi.Float, truncation)
-    greatest = [-limit * dr.full(mi.Float, 1, dr.width(points)) for _ in range(votes)]
+    limit, count = dr.opaque(mi.Float, truncation), dr.width(points)
+    # Per point, how many views say at least each of some distances.
+    histogram = dr.zeros(mi.Float, count * (_LEVELS + 1))
+    lane = dr.arange(mi.UInt32, count) * (_LEVELS + 1)
     for index, depth in enumerate(depths):
         height, width = depth.shape
         film, along = views.project(index, points)
@@ -51,9 +57,22 @@ def fused_distance(points: mi.Point3f, views: PinholeViews, depths: list[np.ndar
         between = ((1 - part[1]) * ((1 - part[0]) * near[0] + part[0] * near[1])
                    + part[1] * ((1 - part[0]) * near[2] + part[0] * near[3]))
         seen = dr.select(most - least < limit, between, least)
-        distance = dr.norm(points - mi.Point3f(views.origins[index]))
-        vote = dr.select(framed & (least >= 0), dr.clip(seen - distance, -limit, limit), -limit)
-        for rank in range(votes):
-            greatest[rank], vote = dr.maximum(greatest[rank], vote), dr.minimum(greatest[rank], vote)
-        dr.eval(greatest)
-    return greatest[-1]
+        vote = (seen - dr.norm(points - mi.Point3f(views.origins[index]))) / limit
+        told = framed & (least >= 0) & (vote > -1)
+        level = mi.UInt32(dr.clip((vote + 1) * (0.5 * _LEVELS), 0, _LEVELS))
+        dr.scatter_reduce(dr.ReduceOp.Add, histogram, mi.Float(1), lane + level, told)
+        dr.eval(histogram)
+    total = mi.Float(0)
+    for level in range(_LEVELS + 1):
+        total += dr.gather(mi.Float, histogram, lane + level)
+    needed, above, found = share * total, mi.Float(0), -dr.full(mi.Float, 1, count)
+    open_ = total > 0
+    for level in reversed(range(_LEVELS + 1)):
+        here = dr.gather(mi.Float, histogram, lane + level)
+        reached = open_ & (above + here >= needed) & (here > 0)
+        part = dr.clip((needed - above) / dr.maximum(here, 1), 0, 1)
+        top = 1.0 if level == _LEVELS else 2 * (level + 1 - part) / _LEVELS - 1
+        found = dr.select(reached, dr.minimum(top, 1), found)
+        open_ &= ~reached
+        above += here
+    return limit * found

@@ -28,6 +28,9 @@ _SMOOTHING = 0.5
 #: Standard errors by which a change has to be better.
 _SURE = 2.0
 
+#: Errors of this size are none.
+_EXACT = 1e-3
+
 #: Views that have to tell of a place before their spread does.
 _VIEWS = 4
 
@@ -41,7 +44,8 @@ class Verdict:
 
     Attributes:
         before, after: (P,) mean error of a ray.
-        gain: (P,) mean, over the unseen views, of the error before less that after.
+        gain: (P,) mean, over the unseen views, of the logarithm of the error before over that after: what is
+            dark, or seen by some views far better than by others, counts as much as the rest.
         noise: (P,) standard error of the gain; infinite where hardly a view tells. Views are independent of
             each other, rays of one view are not.
     """
@@ -186,16 +190,19 @@ class Judge:
 
 def _verdict(rays: np.ndarray, before: np.ndarray, after: np.ndarray) -> Verdict:
     """From (P, N) rays of each place and view, and the sums of their errors."""
-    seen = (rays > 0).sum(axis=1)
-    mean = np.maximum(rays.sum(axis=1), 1) / np.maximum(seen, 1)
-    # Sums over mean numbers: a view that hardly sees a place has hardly a say.
-    difference = (before - after) / mean[:, None]
-    gain = difference.sum(axis=1) / np.maximum(seen, 1)
-    spread = np.where(rays > 0, (difference - gain[:, None] * rays / mean[:, None]) ** 2, 0).sum(axis=1)
-    noise = np.sqrt(spread / np.maximum(seen - 1, 1) / np.maximum(seen, 1))
+    total, seen = rays.sum(axis=1), (rays > 0).sum(axis=1)
+    mean = np.maximum(total / np.maximum(seen, 1), 1)[:, None]
+    # A view that hardly sees a place has hardly a say; one that sees much of it has one voice.
+    weight = np.minimum(rays / mean, 1)
+    per_ray = np.maximum(rays, 1)
+    change = np.log((before / per_ray + _EXACT) / (after / per_ray + _EXACT))
+    voices = np.maximum(weight.sum(axis=1), 1e-12)
+    gain = (weight * change).sum(axis=1) / voices
+    spread = (weight**2 * (change - gain[:, None]) ** 2).sum(axis=1)
+    noise = np.sqrt(spread * seen / np.maximum(seen - 1, 1)) / voices
     noise[seen < _VIEWS] = np.inf
-    total = np.maximum(rays.sum(axis=1), 1)
-    return Verdict(before.sum(axis=1) / total, after.sum(axis=1) / total, gain, noise)
+    per_ray = np.maximum(total, 1)
+    return Verdict(before.sum(axis=1) / per_ray, after.sum(axis=1) / per_ray, gain, noise)
 
 
 def _sides(scene: mi.Scene, corners: mi.UInt32, ray: mi.Ray3f) -> list[tuple[mi.UInt32, mi.Float, mi.Bool]]:

@@ -26,8 +26,9 @@ _MARGIN = 0.6
 #: Largest distance that is told from others, in cells.
 _TRUNCATION = 3.0
 
-#: Share of the views that have to see through a point, of which there are two at least.
-_VOTES = 0.03
+#: Share of the views from which nothing hides a point that have to see through it. The more, the nearer to the
+#: masks; the fewer, the thinner may be what is seen from one side only.
+_VOTES = 0.3
 
 #: Coverage from which on a pixel shows the object.
 _COVERED = 0.5
@@ -83,7 +84,7 @@ def volume_surface(volume: RadianceVolume, scene: FitScene, lattice: Lattice,
         progress()
     near = np.flatnonzero(distance < 2 * cell)
     inside = fused_distance(mi.Point3f(points.numpy()[:, near]), views, depths, truncation=_TRUNCATION * cell,
-                            votes=max(2, round(_VOTES * len(views))))
+                            share=_VOTES)
     distance[near] = np.maximum(distance[near], inside.numpy())
     outside = _without_specks((distance / cell).reshape((lattice.stride,) * 3), margin) - margin
     sdf = closed_at_border(lattice.spacing * outside.ravel(), lattice)
