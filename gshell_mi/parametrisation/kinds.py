@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import mitsuba as mi
 
@@ -62,4 +62,5 @@ def make_parametrisation(name: str, start: Mapping[str, mi.Float], lattice: Latt
     >>> bool(dr.all(fields.fields()["sdf"] < ball)[0])
     True
     """
-    return parametrisation_named(name)(start, lattice, rules or StepRules(), seed)
+    kind: Callable[..., Parametrisation] = parametrisation_named(name)  # each is made from these four
+    return kind(start, lattice, rules or StepRules(), seed)
