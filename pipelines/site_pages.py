@@ -45,9 +45,8 @@ LIBRARY = {
     "export": ("Export", "What a fit leaves behind, and what can be made of it.",
                ["export", "turntable", "report", "viewer"]),
     "commands": ("Commands and machine", "What the commands share, and what the machine can do.",
-                 ["command_line", "streams", "interrupt", "errors", "files", "own_folder", "memory", "kernel_cache",
-                  "timing",
-                  "wording", "progress", "doctor"]),
+                 ["command_line", "streams", "interrupt", "errors", "files", "own_folder", "memory",
+                  "kernel_cache", "timing", "wording", "progress", "doctor"]),
 }
 
 #: Packages of which only the modules right inside are described: what lies deeper may change.
