@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import mitsuba as mi
 
@@ -62,5 +62,6 @@ def make_parametrisation(name: str, start: Mapping[str, mi.Float], lattice: Latt
     >>> bool(dr.all(fields.fields()["sdf"] < ball)[0])
     True
     """
-    kind: Callable[..., Parametrisation] = parametrisation_named(name)  # each is made from these four
-    return kind(start, lattice, rules or StepRules(), seed)
+    kind = parametrisation_named(name)
+    # The base class does not say how its kinds are made, but all are made like this.
+    return kind(start, lattice, rules or StepRules(), seed)  # pyright: ignore[reportCallIssue]
