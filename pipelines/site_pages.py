@@ -28,7 +28,8 @@ LIBRARY = {
                ["fields", "template", "parametrisation", "activations"]),
     "extraction": ("Extraction", "From fields to meshes, with derivatives.", ["extraction"]),
     "mesh": ("Meshes", "From meshes back to fields; what meshes are like.",
-             ["conversion", "mesh_files", "topology", "triangles", "visibility", "diagnostics"]),
+             ["conversion", "mesh_files", "topology", "triangles", "visibility", "coincident",
+              "diagnostics"]),
     "shape": ("The shape plugin", "`gshell` for Mitsuba.", ["shape", "plugins", "compat"]),
     "integrators": ("Integrators", "`gshell_path` and `gshell_mask` for Mitsuba.",
                     ["integrators.gshell_path", "integrators.gshell_mask", "integrators"]),
@@ -44,8 +45,8 @@ LIBRARY = {
     "export": ("Export", "What a fit leaves behind, and what can be made of it.",
                ["export", "turntable", "report", "viewer"]),
     "commands": ("Commands and machine", "What the commands share, and what the machine can do.",
-                 ["command_line", "streams", "interrupt", "errors", "files", "own_folder", "memory", "timing",
-                  "wording", "progress", "doctor"]),
+                 ["command_line", "streams", "interrupt", "errors", "files", "own_folder", "memory",
+                  "kernel_cache", "timing", "wording", "progress", "doctor"]),
 }
 
 #: Packages of which only the modules right inside are described: what lies deeper may change.

@@ -62,4 +62,6 @@ def make_parametrisation(name: str, start: Mapping[str, mi.Float], lattice: Latt
     >>> bool(dr.all(fields.fields()["sdf"] < ball)[0])
     True
     """
-    return parametrisation_named(name)(start, lattice, rules or StepRules(), seed)
+    kind = parametrisation_named(name)
+    # The base class does not say how its kinds are made, but all are made like this.
+    return kind(start, lattice, rules or StepRules(), seed)  # pyright: ignore[reportCallIssue]
