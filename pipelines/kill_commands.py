@@ -42,7 +42,7 @@ COMMANDS = {
     "turntable": (["turntable", "{}/fit", "--frames", "8", "--size", "64", "--quiet"], "fit"),
     "report": (["report", "{}/fit", "--turntable-frames", "4", "--turntable-size", "64"], "fit"),
     "fit": (["fit", "{}/in/bowl.xml", "-o", "{}/out", "--quiet", "--checkpoint-seconds", "0", *SHORT, *CLOSED,
-             "--second-look", "1"], "out"),
+             "--joint.revision", "1"], "out"),
 }
 
 #: How far a fit's surface may be from that of a whole one, in % of its diagonal, and as a multiple of what
