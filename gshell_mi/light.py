@@ -16,6 +16,20 @@ from .compat import environment_data, environment_radiance
 MINIMUM_RADIANCE = 1e-4
 
 
+def turns_with_camera(sensors: list[mi.Sensor]) -> list[mi.ScalarTransform4f]:
+    """Rotations of a light that is fixed to the camera, as where an object turns on a turntable.
+
+    Returns:
+        For each sensor the rotation from the world as the first one sees it.
+    """
+    axes = [np.array(mi.traverse(sensor)["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+            for sensor in sensors]
+    axes = [matrix / np.linalg.norm(matrix, axis=0) for matrix in axes]
+    turns = np.tile(np.eye(4), (len(axes), 1, 1))
+    turns[:, :3, :3] = [matrix @ axes[0].T for matrix in axes]
+    return [mi.ScalarTransform4f(turn) for turn in turns]
+
+
 class EnvironmentLight:
     """A latitude-longitude environment map whose radiance is the exponential of its parameter.
 
@@ -56,6 +70,10 @@ class EnvironmentLight:
     @property
     def radiance(self) -> mi.TensorXf:
         return dr.exp(self.log_radiance)
+
+    def turned(self, turn: mi.ScalarTransform4f) -> mi.Transform4f:
+        """``to_world`` of the emitter where the light has turned."""
+        return mi.Transform4f(turn @ self._to_world)
 
     @cached_property
     def solid_angles(self) -> mi.TensorXf:

@@ -15,6 +15,7 @@ import trimesh
 
 from ..files import replacing
 from ..images import over_white, psnr, triptych, write_png
+from ..light import turns_with_camera
 from ..own_folder import OwnFolder
 from ..scene_files import load_scene
 from ..topology import topology
@@ -34,7 +35,8 @@ _EXPORT_SPP = 32
 
 
 def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMaterial,
-               light: EnvironmentLight | None, views: int, detail: ColorDetail | None = None) -> dict:
+               light: EnvironmentLight | None, views: int, detail: ColorDetail | None = None, *,
+               light_turns: bool = False) -> dict:
     """Writes meshes, light, scene and triptychs.
 
     Args:
@@ -42,6 +44,7 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
         light: None if it is the scene's own.
         views: how many, spread evenly, are rendered.
         detail: of the base colour. Triangles are split in four, so that their vertices hold it.
+        light_turns: whether the light turns with the camera: then it is stored as the first view has it.
 
     Returns:
         The metrics, which ``write_metrics`` stores.
@@ -60,7 +63,8 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
     write_light(output / "light.exr", fit.light, light)
     write_scene(output / "scene.xml", fit.light, fit.sensors)
-    scores = _write_views(output, fit, shown)
+    turns = turns_with_camera(fit.sensors) if light and light_turns else []
+    scores = _write_views(output, fit, shown, [light.turned(turn) for turn in turns] if light else [])
     vertices, faces, _ = surface.to_numpy()
     return {
         "scene": fit.path.name,
@@ -99,15 +103,23 @@ def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.nd
     write_ply(path, vertices, faces, normals, attributes)
 
 
-def _write_views(output: Path, fit: FitScene, shown: np.ndarray) -> dict[str, float]:
-    """Renders the exported scene from the views ``shown``; writes triptychs, returns PSNR by view id."""
+def _write_views(output: Path, fit: FitScene, shown: np.ndarray,
+                 lights: list[mi.Transform4f]) -> dict[str, float]:
+    """Renders the exported scene from the views ``shown``; writes triptychs, returns PSNR by view id.
+
+    Args:
+        lights: per view ``to_world`` of the light, if it turns with the camera.
+    """
     folder = output / "views"
     folder.mkdir(exist_ok=True)
     scene = load_scene(output / "scene.xml")
     integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
-    scores = {}
+    scores, parameters = {}, mi.traverse(scene)
     for index in shown:
         sensor, target = fit.sensors[index], fit.targets[index]
+        if lights:
+            parameters["light.to_world"] = lights[index]
+            parameters.update()
         image = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=_EXPORT_SPP))
         scores[sensor.id()] = psnr(over_white(image), over_white(target.rgba))
         write_png(folder / f"{sensor.id()}.png", triptych(target.rgba, image))

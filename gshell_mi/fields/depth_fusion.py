@@ -8,7 +8,6 @@ import numpy as np
 
 from ..views import PinholeViews
 
-
 #: Levels between the truncations at which the views' distances are told apart.
 _LEVELS = 24
 

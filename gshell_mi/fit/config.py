@@ -42,6 +42,9 @@ class FitConfig:
     """Steps of the joint stage."""
     known_light: bool = False
     """Keep the scene's light as it is instead of optimising it."""
+    light_frame: Literal["world", "camera"] = "world"
+    """What the light is fixed to: the world, or the camera, as where an object turns on a turntable before
+    a camera on a tripod. The exported light is then as the first view has it."""
     fixed_material: bool = False
     """Keep the uniform principled material that the scene gives the gshell shape."""
     geometry_only: bool = False

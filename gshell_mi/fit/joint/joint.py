@@ -16,7 +16,7 @@ from ...errors import UserError
 from ...fields import LatticeFields
 from ...fields.smoothing import LatticeDiffusion
 from ...images import decibels
-from ...light import EnvironmentLight
+from ...light import EnvironmentLight, turns_with_camera
 from ...material import GivenMaterial, MaterialField, principled
 from ...means import mean
 from ...outliers import finite
@@ -76,6 +76,8 @@ class JointStage:
             self.subject.attach_attribute(name, field)
         self.scene = optimised_scene(fit, light)
         self.parameters = mi.traverse(self.scene)
+        #: Per view, how the light has turned; none if it stays.
+        self._turns = turns_with_camera(fit.sensors) if light and config.light_frame == "camera" else []
         self._targets = [mi.TensorXf(target.rgba) for target in fit.targets]
         self._sees_masks = all(target.has_alpha for target in fit.targets) and not config.geometry_only
         if config.geometry_only:
@@ -122,11 +124,19 @@ class JointStage:
         with phase("scene update"):
             self.apply(geometry=moving)
         views = self._views(iteration)
-        images = [self._render(view, self.seed(iteration, turn)) for turn, view in enumerate(views)]
+        images, color, mask = [], mi.Float(0), mi.Float(0)
+        for turn, view in enumerate(views):
+            image = self._render(view, self.seed(iteration, turn))
+            with phase("losses") as compute:
+                of_color, of_mask = self._image_loss(view, image), self._mask_loss(view, image)
+                of_view = (of_color + self.config.losses.mask * of_mask) / len(views)
+                compute(of_view)
+            # A light that turns with the camera has to be where it was when the image is differentiated.
+            with phase("backward"):
+                dr.backward(of_view, flags=dr.ADFlag.ClearVertices)
+            color, mask = color + dr.detach(of_color) / len(views), mask + dr.detach(of_mask) / len(views)
+            images.append(dr.detach(image))
         with phase("losses") as compute:
-            color = sum(self._image_loss(view, image) for view, image in zip(views, images, strict=True))
-            mask = sum(self._mask_loss(view, image) for view, image in zip(views, images, strict=True))
-            color, mask = color / len(views), mask / len(views)
             regularisation, terms = self._regularisers(views)
             total = color + self.config.losses.mask * mask + regularisation
             compute(total)
@@ -192,6 +202,9 @@ class JointStage:
 
     def _render(self, view: int, seed: int) -> mi.TensorXf:
         config = self.config.render
+        if self._turns:
+            self.parameters["light.to_world"] = self.light.turned(self._turns[view])
+            self.parameters.update()
         with phase("render") as compute:
             image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[view],
                               integrator=self.integrator, spp=config.primal_spp, spp_grad=config.spp,

@@ -87,7 +87,9 @@ class TopologyRevision:
         #: The steps before which openings change and are judged.
         self._changes = round(joint.stage.revision * count)
         self._judges = (self._changes + count + 1) // 2
-        if not joint.geometry.is_explicit or joint.config.watertight or self._judges >= count:
+        # What it renders has one light for all views.
+        one_light = joint.config.light_frame == "world"
+        if not (joint.geometry.is_explicit and one_light) or joint.config.watertight or self._judges >= count:
             self._changes = count     # never
         self._state = dict(state)
         if (frozen := self._state.pop("frozen", None)) is not None:

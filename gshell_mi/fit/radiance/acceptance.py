@@ -48,7 +48,7 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge) -> np.ndarr
         # At last there is no time for more.
         worst = ~verdict.accepted
         if closing:
-            loss = np.where(worst, -verdict.gain, -np.inf)
+            loss = np.where(worst, np.maximum(-verdict.gain, 0), 0)
             worst &= loss >= _WORST * loss.max()
         kept = kept & ~worst[place]
         if not kept.any():

@@ -26,8 +26,8 @@ _MARGIN = 0.6
 #: Largest distance that is told from others, in cells.
 _TRUNCATION = 3.0
 
-#: Share of the views from which nothing hides a point that have to see through it. The more, the nearer to the
-#: masks; the fewer, the thinner may be what is seen from one side only.
+#: Share of the views from which nothing hides a point that have to see through it. The more, the nearer to
+#: the masks; the fewer, the thinner may be what is seen from one side only.
 _VOTES = 0.3
 
 #: Coverage from which on a pixel shows the object.

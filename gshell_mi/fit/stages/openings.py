@@ -34,6 +34,10 @@ from ..stage import Fit
 from ..surface import TYPICAL_REFLECTANCE, Seen, Surface
 from ..template import template_of
 
+#: Logits below which connected parts are proposed as openings, one after the other as long as some are
+#: rejected: where gloss has made nearly all transparent, an opening still is so the most.
+_LEVELS = 0.0, -0.75, -1.5, -2.25
+
 #: Logit, at most, of what has been justified before.
 _OPEN = -1.0
 
@@ -154,11 +158,21 @@ def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, rou
         if trained_again:
             appearance.begin_again(unjustified, opened)
             train(trained_again)
-        proposed = clean(appearance.smoothed_logits())
-        proposed = np.where(opened, np.minimum(proposed, _OPEN), proposed)
-        logits = proposed
-        for without_rejected in (close_rejected, open_rejected):
-            logits = clean(without_rejected(logits, template, judge))
+        smoothed = appearance.smoothed_logits()
+        proposed = clean(np.where(opened, np.minimum(smoothed, _OPEN), smoothed))
+        logits = np.where(opened, _OPEN, np.abs(smoothed))
+        for level in _LEVELS:
+            # Openings of the levels before, and what is as transparent as this one.
+            candidate = clean(np.minimum(logits, smoothed - level))
+            if not ((candidate <= 0) & (logits > 0)).any():
+                continue
+            found = candidate
+            for without_rejected in (close_rejected, open_rejected):
+                found = clean(without_rejected(found, template, judge))
+            logits = np.minimum(logits, found)
+            if ((found <= 0) == (candidate <= 0)).all():
+                break
+        logits = clean(logits)
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
         unjustified |= (proposed <= 0) & (logits > 0)
