@@ -23,9 +23,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "pipelines"))
 from scene_builder import files
 
 CASES = ("32:24:128", "64:24:128", "64:48:256", "128:24:256", "64:12:800")
-SHORT = ("--openings.iterations", "15", "--openings.gain", "2", "--cavities.iterations", "10",
-         "--refinement.iterations", "6", "--folds.iterations", "0",
-         "--refinement.gain", "9", "--iterations", "12")
+SHORT = ("--openings.iterations", "15", "--cavities.iterations", "10",
+         "--refinement.iterations", "6", "--folds.iterations", "0", "--iterations", "12")
 
 
 def write_case(reference: mi.Scene, work: Path, resolution: int, views: int, pixels: int) -> Path:

@@ -13,12 +13,11 @@ _MOVED = {
     "radiance": {"ghost-batch": "batch", "ghost-sheets": "layers", "ghost-lr": "lr",
                  "ghost-smoothing": "smoothing"},
     "openings": {f"ghost-{name}": name for name in ("iterations", "mask", "daylight", "binary", "closing",
-                                                    "chroma", "gain", "rounds")},
-    "cavities": {"vessel-gain": "vessel-gain", "carving-iterations": "iterations", "carving-batch": "batch",
-                 "carving-lr": "lr", "carving-radiance-lr": "radiance-lr"},
+                                                    "chroma", "rounds")},
+    "cavities": {f"carving-{name}": name for name in ("iterations", "batch", "lr", "radiance-lr")},
     "refinement": {f"refinement-{name}": name for name in ("iterations", "lr", "smoothing", "detail",
-                                                           "radiance-lr", "outline", "gain")},
-    "folds": {f"folds-{name}": name for name in ("iterations", "lr", "detail", "descent", "gain")},
+                                                           "radiance-lr", "outline")},
+    "folds": {f"folds-{name}": name for name in ("iterations", "lr", "detail", "descent")},
     "volume": {f"volume-{name}": name for name in ("iterations", "side", "resolution", "batch", "density-lr",
                                                    "radiance-lr", "direction-lr", "mask", "distortion")},
     "render": {"step-views": "views"} | {name: name for name in ("spp", "primal-spp", "max-depth",
@@ -37,13 +36,16 @@ _MOVED = {
     "detail": {"detail-iterations": "iterations"},
 }
 
+#: Flags that nothing has taken the place of.
+GONE = ("ghost-gain", "vessel-gain", "refinement-gain", "folds-gain")
+
 #: The new flag of each old one, without dashes.
 RENAMED = {old: f"{group}.{new}" if group else new for group, names in _MOVED.items()
            for old, new in names.items()}
 
 
 def check_flags(words: Iterable[str]) -> None:
-    """Raises a ``UserError`` if one of a command's words is a flag of another name now.
+    """Raises a ``UserError`` if one of a command's words is a flag of another name now, or of none.
 
     >>> check_flags(["--joint.warmup", "0.2"])
     >>> check_flags(["--warmup=0.2"])
@@ -52,5 +54,7 @@ def check_flags(words: Iterable[str]) -> None:
     """
     for word in words:
         name = word.partition("=")[0].removeprefix("--").replace("_", "-")
+        if word.startswith("--") and name in GONE:
+            raise UserError(f"--{name} is gone, as one judge decides what is kept; leave it out.")
         if word.startswith("--") and name in RENAMED:
             raise UserError(f"--{name} is called --{RENAMED[name]} now; --help lists all settings.")

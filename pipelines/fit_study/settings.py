@@ -38,8 +38,8 @@ def parsed_settings(pairs: list[str]) -> FitConfig:
 def as_flags(changes: dict) -> str:
     """Settings as the options of ``python -m gshell_mi.fit``.
 
-    >>> as_flags({"openings.gain": 0.0, "watertight": True, "losses.extra": {"eikonal": 0.5}})
-    '--openings.gain 0 --watertight --losses.extra eikonal 0.5'
+    >>> as_flags({"openings.mask": 0.0, "watertight": True, "losses.extra": {"eikonal": 0.5}})
+    '--openings.mask 0 --watertight --losses.extra eikonal 0.5'
     """
     words = []
     for name, value in changes.items():

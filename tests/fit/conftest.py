@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import trimesh
 
@@ -5,3 +6,18 @@ import trimesh
 @pytest.fixture(scope="session")
 def ball() -> trimesh.Trimesh:
     return trimesh.creation.icosphere(4)
+
+
+@pytest.fixture
+def decisions(monkeypatch):
+    """Call it with what the judge shall say of the next changes of the whole surface: of the refinement, the
+    folds and the volume, as far as there are any."""
+    from gshell_mi.fit.judge import Judge, Verdict
+
+    said: list[bool] = []
+
+    def decide(self, before, after) -> Verdict:
+        return Verdict(np.ones(1), np.ones(1), np.array([1.0 if said.pop(0) else -1.0]), np.array([0.1]))
+
+    monkeypatch.setattr(Judge, "decide", decide)
+    return lambda *accepted: said.extend(accepted)

@@ -16,7 +16,7 @@ from gshell_mi.errors import UserError
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
-from gshell_mi.fit.flags import RENAMED
+from gshell_mi.fit.flags import GONE, RENAMED
 from gshell_mi.fit.stages.openings import Openings
 from gshell_mi.own_folder import OwnFolder
 
@@ -255,6 +255,13 @@ def test_flags_of_earlier_versions_are_told_the_new_name(old, capfd):
     assert main(["scene.xml", f"--{old}", "1"]) == 2
     told = capfd.readouterr().err.strip()
     assert told == f"error: --{old} is called --{RENAMED[old]} now; --help lists all settings."
+
+
+@pytest.mark.parametrize("old", GONE)
+def test_flags_that_are_gone_are_told_so(old, capfd):
+    assert main(["scene.xml", f"--{old}=0.9"]) == 2
+    told = capfd.readouterr().err.strip()
+    assert told == f"error: --{old} is gone, as one judge decides what is kept; leave it out."
 
 
 def test_the_new_names_are_settings():

@@ -81,11 +81,11 @@ def test_the_rows_switch_every_loss():
 
 
 def test_settings_as_text():
-    config = parsed_settings(["resolution=48", "grid=bcc", "openings.gain=1", "losses.image=l1",
+    config = parsed_settings(["resolution=48", "grid=bcc", "openings.mask=1", "losses.image=l1",
                               "watertight=true"])
     assert config == FitConfig(resolution=48, grid="bcc", watertight=True).changed(
-        {"openings.gain": 1.0, "losses.image": "l1"})
-    assert as_flags(non_default(config)) == ("--resolution 48 --grid bcc --watertight --openings.gain 1 "
+        {"openings.mask": 1.0, "losses.image": "l1"})
+    assert as_flags(non_default(config)) == ("--resolution 48 --grid bcc --watertight --openings.mask 1 "
                                              "--losses.image l1")
 
 

@@ -34,17 +34,18 @@ def test_it_goes_on_where_the_first_round_has_ended():
     assert second.lr > first.lr and second.detail < first.detail
 
 
-@pytest.mark.parametrize(("gain", "kept"), [("0", False), ("1000", True)])
-def test_metrics_say_whether_it_was_kept(bowl_scene, tmp_path, gain, kept):
-    metrics = run(bowl_scene, tmp_path, "--refinement.gain", "1000", "--folds.gain", gain)
+@pytest.mark.parametrize("kept", [False, True])
+def test_metrics_say_whether_it_was_kept(bowl_scene, tmp_path, decisions, kept):
+    decisions(True, kept)
+    metrics = run(bowl_scene, tmp_path)
     assert (metrics["refinement_kept"], metrics["folds_kept"]) == (True, kept)
     assert steps(tmp_path) == rounds(2, 4) and metrics["seconds"]["folds"] > 0
 
 
-@pytest.mark.parametrize("arguments", [("--refinement.gain", "0"),
-                                       ("--refinement.gain", "1000", "--folds.iterations", "0")],
+@pytest.mark.parametrize(("first", "arguments"), [(False, ()), (True, ("--folds.iterations", "0"))],
                          ids=["first round dropped", "off"])
-def test_there_may_be_none(bowl_scene, tmp_path, arguments):
+def test_there_may_be_none(bowl_scene, tmp_path, decisions, first, arguments):
+    decisions(first)
     assert "folds_kept" not in run(bowl_scene, tmp_path, *arguments)
     assert steps(tmp_path) == rounds(2, 0)
 
@@ -64,24 +65,26 @@ def ended_within_it(scene, output, monkeypatch, *arguments):
     assert not (output / "mesh.ply").exists()
 
 
-def test_ended_within_it_and_resumed(bowl_scene, tmp_path, monkeypatch):
-    arguments = ("--refinement.gain", "1000", "--folds.gain", "1000", "--checkpoint-seconds", "0")
+def test_ended_within_it_and_resumed(bowl_scene, tmp_path, monkeypatch, decisions):
+    decisions(True, True)
+    arguments = ("--checkpoint-seconds", "0")
     ended_within_it(bowl_scene, tmp_path, monkeypatch, *arguments)
     metrics = run(bowl_scene, tmp_path, *arguments, "--resume")
     assert steps(tmp_path) == rounds(2, 4) and metrics["folds_kept"]
 
 
-STALLS = ("--refinement.gain", "1000", "--folds.gain", "1000", "--folds.iterations", "16",
-          "--folds.descent", "0")
+STALLS = ("--folds.iterations", "16", "--folds.descent", "0")
 
 
-def test_it_ends_after_a_quarter_where_the_error_does_not_fall(bowl_scene, tmp_path):
+def test_it_ends_after_a_quarter_where_the_error_does_not_fall(bowl_scene, tmp_path, decisions):
+    decisions(True)
     metrics = run(bowl_scene, tmp_path, *STALLS)
     assert (metrics["refinement_kept"], metrics["folds_kept"]) == (True, False)
     assert steps(tmp_path) == rounds(2, 4) and metrics["seconds"]["folds"] > 0
 
 
-def test_a_resumed_fit_ends_it_alike(bowl_scene, tmp_path, monkeypatch):
+def test_a_resumed_fit_ends_it_alike(bowl_scene, tmp_path, monkeypatch, decisions):
+    decisions(True)
     arguments = (*STALLS, "--checkpoint-seconds", "0")
     ended_within_it(bowl_scene, tmp_path, monkeypatch, *arguments)
     metrics = run(bowl_scene, tmp_path, *arguments, "--resume")
