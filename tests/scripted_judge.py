@@ -1,0 +1,39 @@
+"""A judge whose evidence is given: an error per vertex for what is opaque."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from gshell_mi.fit.judge import Mesh, Verdict
+
+
+class ScriptedJudge:
+    """Takes the place of ``Judge`` where a test says how badly images are explained.
+
+    Args:
+        count: vertices of the template.
+        error: maps (V,) opaque or not to (V,) errors of the rays that meet each vertex first.
+        noise: standard error of every gain.
+    """
+
+    def __init__(self, count: int, error: Callable[[np.ndarray], np.ndarray], noise: float = 0.05):
+        self.count, self.error, self.noise = count, error, noise
+        self.asked: list[np.ndarray] = []
+
+    def shown(self, mesh: Mesh) -> np.ndarray:
+        """(V,) which of the template's vertices are opaque."""
+        opaque = np.zeros(self.count, bool)
+        used = np.unique(mesh[1])
+        opaque[used[used < self.count]] = True
+        self.asked.append(opaque)
+        return opaque
+
+    def compare(self, before: np.ndarray, after: np.ndarray, places: tuple[Mesh, np.ndarray]) -> Verdict:
+        """By the mean errors of each place's vertices."""
+        label = places[1]
+        told = label >= 0
+        number = np.maximum(np.bincount(label[told]), 1)
+        first, second = (np.bincount(label[told], self.error(opaque)[told]) / number
+                         for opaque in (before, after))
+        gain = np.log(np.maximum(first, 1e-9) / np.maximum(second, 1e-9))
+        return Verdict(first, second, gain, np.full(len(gain), self.noise))
