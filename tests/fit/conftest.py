@@ -21,3 +21,21 @@ def decisions(monkeypatch):
 
     monkeypatch.setattr(Judge, "decide", decide)
     return lambda *accepted: said.extend(accepted)
+
+
+@pytest.fixture
+def rejecting(monkeypatch):
+    """The judge rejects everything."""
+    _say(monkeypatch, False)
+
+
+@pytest.fixture
+def accepting(monkeypatch):
+    """The judge accepts everything."""
+    _say(monkeypatch, True)
+
+
+def _say(monkeypatch, accepted: bool) -> None:
+    from gshell_mi.fit.judge import Verdict
+
+    monkeypatch.setattr(Verdict, "accepted", property(lambda self: np.full(len(self.gain), accepted)))

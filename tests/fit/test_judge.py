@@ -8,13 +8,10 @@ import trimesh
 from bowl import RADIUS, half_sphere
 from scipy.spatial import Delaunay
 
-from gshell_mi.fit import FitConfig
-from gshell_mi.fit.judge import Verdict, judge
-from gshell_mi.fit.radiance.surface_radiance import RadianceConfig
+from gshell_mi.fit.judge import Judge, Verdict
+from gshell_mi.fit.judge import _verdict as _judged
 from gshell_mi.scene import load_fit_scene
 from gshell_mi.views import PinholeViews
-
-CONFIG = FitConfig(radiance=RadianceConfig(batch=16384))
 
 
 def _bowl() -> tuple[np.ndarray, np.ndarray]:
@@ -42,7 +39,7 @@ def _verdict(scene, before, after, spoil=lambda rgba: rgba) -> Verdict:
     views = PinholeViews.from_sensors(scene.sensors)
     targets = [dataclasses.replace(target, rgba=spoil(target.rgba).astype(np.float32))
                for target in scene.targets]
-    return judge(before, after, views, targets, CONFIG)
+    return Judge(views, targets, Judge.halves(len(views)), batch=16384).decide(before, after)
 
 
 def test_an_opening_that_is_there_is_accepted_and_a_lid_rejected(scene):
@@ -66,3 +63,31 @@ def test_noise_in_the_images_does_not_change_what_is_accepted(scene):
 
     assert _verdict(scene, _with_lid(), _bowl(), noisy).accepted
     assert not _verdict(scene, _bowl(), _with_lid(), noisy).accepted
+
+
+def test_each_place_is_judged_by_the_rays_that_meet_it_first(scene):
+    """The lid is wrong; the bowl's wall is the same with and without it."""
+    views = PinholeViews.from_sensors(scene.sensors)
+    judge = Judge(views, scene.targets, Judge.halves(len(views)), batch=16384)
+    closed, opened = _with_lid(), _bowl()
+    lid = np.arange(len(closed[0])) >= len(opened[0])
+    place = np.where(lid, 0, np.where(closed[0][:, 1] < -0.4 * RADIUS, 1, -1))
+    verdict = judge.compare(judge.shown(closed), judge.shown(opened), (closed, place))
+    assert verdict.accepted.tolist() == [True, False]
+    assert verdict.after[0] < 0.7 * verdict.before[0]
+    assert verdict.gain[1] == pytest.approx(0, abs=0.05)
+
+
+def test_a_constant_residual_neither_passes_nor_blocks_a_change():
+    rng = np.random.default_rng(1)
+    rays, noise = np.full((1, 40), 100.0), rng.normal(0, 1, (1, 40))
+    for residual in (0.1, 10.0):
+        before = 100 * (residual + 0.5 + 0.02 * noise)
+        assert _judged(rays, before, before - 50).accepted
+        assert not _judged(rays, before, before + 2 * rng.normal(0, 1, (1, 40))).accepted
+
+
+def test_few_views_are_not_enough():
+    rays = np.zeros((1, 40))
+    rays[:, :3] = 100
+    assert not _judged(rays, 100.0 * (rays > 0), 10.0 * (rays > 0)).accepted

@@ -57,8 +57,7 @@ def test_a_block_stays(trained):
     assert trained(solid_block)[2] is None
 
 
-def test_hollows_have_to_be_justified(trained, monkeypatch):
-    monkeypatch.setattr(carving, "_GAIN", 0.0)
+def test_hollows_have_to_be_justified(trained, rejecting):
     assert trained(cup)[2] is None
 
 

@@ -60,8 +60,8 @@ def test_an_opening_is_not_blamed_for_what_is_missing_behind_it(ball):
 def test_many_rejected_openings_go_at_once_in_the_end(ball):
     directions = np.vstack([np.eye(3), -np.eye(3)])
     opened = np.any([cap(ball, direction, 0.02) for direction in directions], axis=0)
-    result, judge = _closed(ball, np.where(opened, -1.0, 1.0),
-                            lambda opaque: np.where(opaque, 1.0, np.exp(3.0 ** (4 + ball.vertices @ [1, 2, 3]) / 100)))
+    worse = np.exp(3.0 ** (4 + ball.vertices @ [1, 2, 3]) / 100)
+    result, judge = _closed(ball, np.where(opened, -1.0, 1.0), lambda opaque: np.where(opaque, 1.0, worse))
     assert (result > 0).all()
     assert len(judge.asked) <= 1 + 5, "closed, and five rounds for six openings"
 

@@ -141,32 +141,6 @@ def lidded_bowl() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return vertices, faces, lid
 
 
-@pytest.fixture(scope="module")
-def bowl(bowl_scene):
-    fit = load_fit_scene(bowl_scene)
-    views = PinholeViews.from_sensors(fit.sensors)
-    vertices, faces, lid = lidded_bowl()
-    appearance = SurfaceRadiance(vertices, faces, views, PixelPool(views, fit.targets), CONFIG)
-    return appearance, vertices, lid
-
-
-def test_a_true_opening_lowers_the_error_and_a_false_one_raises_it(bowl):
-    appearance, vertices, lid = bowl
-    bottom = vertices[:, 1] < -0.85 * RADIUS
-    closed = appearance.image_error(np.ones(len(vertices), bool))
-    truth = appearance.image_error(~lid)
-    assert (truth[:, lid].sum(axis=1) < 0.7 * closed[:, lid].sum(axis=1)).all()
-    wrong = appearance.image_error(~lid & ~bottom)
-    assert (wrong[:, bottom].sum(axis=1) > 2 * truth[:, bottom].sum(axis=1)).all()
-
-
-def test_the_same_question_has_the_same_answer(bowl):
-    """Also after others have been asked: it starts from an adapted radiance, but sees the same rays."""
-    appearance, _, lid = bowl
-    first = appearance.image_error(~lid)[:, lid].sum()
-    assert appearance.image_error(~lid)[:, lid].sum() == pytest.approx(first, rel=0.1)
-
-
 def test_training_tells_the_lid_from_the_bowl(bowl_scene):
     fit = load_fit_scene(bowl_scene)
     views = PinholeViews.from_sensors(fit.sensors)

@@ -1,10 +1,14 @@
 """What false openings hide is found in further rounds."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import trimesh
+from scripted_judge import ScriptedJudge
 
-from gshell_mi.fit.stages.openings import OpeningsConfig, find_openings
+from gshell_mi.fit.stages.openings import find_openings
+from gshell_mi.template.msdf import clean_opacity
 from gshell_mi.topology import equal_patches
 
 BALL = trimesh.creation.icosphere(4)
@@ -41,14 +45,14 @@ class ScriptedRadiance:
         self.rounds += 1
         assert again == self.rounds
 
-    def image_error(self, opaque: np.ndarray) -> np.ndarray:
-        through = np.where(self.false, 3.0, 0.3)
-        return np.tile(np.where(opaque, 1.0, through), (2, 1))
+    def error(self, opaque: np.ndarray) -> np.ndarray:
+        return np.where(opaque, 1.0, np.where(self.false, 3.0, 0.3))
 
 
-def found_openings(appearance: ScriptedRadiance, **settings) -> np.ndarray:
-    config = OpeningsConfig(**settings)
-    return find_openings(appearance, VERTICES, FACES, config, 0.005, appearance.train) <= 0
+def found_openings(appearance: ScriptedRadiance, rounds: int = 3) -> np.ndarray:
+    clean = partial(clean_opacity, vertices=VERTICES, faces=FACES, min_area=0.005)
+    judge = ScriptedJudge(len(VERTICES), appearance.error)
+    return find_openings(appearance, (VERTICES, FACES), judge, rounds, clean, appearance.train) <= 0
 
 
 @pytest.mark.parametrize(("false", "behind", "openings", "rounds"), [
@@ -72,9 +76,20 @@ def test_false_openings_alone_are_reason_enough_for_another_round():
     np.testing.assert_array_equal(opened, appearance.cap((0, 0, 1)))
 
 
-@pytest.mark.parametrize(("settings", "found"), [({"rounds": 0}, True), ({"gain": 0.0}, False)])
-def test_no_rounds_that_are_not_asked_for_or_can_find_nothing(settings, found):
+def test_no_rounds_that_are_not_asked_for():
     appearance = ScriptedRadiance(((0, 0, 1), (0, 1, 0)), ((0, 1, 0),), ((1, 0, 0),))
-    opened = found_openings(appearance, **settings)
+    opened = found_openings(appearance, rounds=0)
     assert appearance.rounds == 0
-    np.testing.assert_array_equal(opened, appearance.cap((0, 0, 1)) & found)
+    np.testing.assert_array_equal(opened, appearance.cap((0, 0, 1)))
+
+
+def test_where_nearly_all_has_become_transparent_the_most_transparent_part_is_proposed():
+    """Gloss: all but the equator is open, and the true opening the most."""
+
+    class Glossy(ScriptedRadiance):
+        def smoothed_logits(self) -> np.ndarray:
+            return np.where(self.cap((0, 0, 1)), -2.0, np.where(np.abs(VERTICES[:, 2]) < 0.2, 2.0, -1.0))
+
+    appearance = Glossy(((0, 0, 1),), (), ())
+    appearance.false = ~appearance.cap((0, 0, 1))
+    np.testing.assert_array_equal(found_openings(appearance, rounds=0), appearance.cap((0, 0, 1)))
