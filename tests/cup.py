@@ -11,6 +11,7 @@ import trimesh
 from gshell_mi.compat import mesh_scene
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit.config import FitConfig
+from gshell_mi.fit.judge import Judge
 from gshell_mi.fit.radiance.surface_radiance import RadianceConfig
 from gshell_mi.fit.stages.cavities import CavitiesConfig
 from gshell_mi.fit.surface import Seen, Surface
@@ -73,9 +74,12 @@ def fit_of(subject: mi.Shape, shape: trimesh.Trimesh, config: FitConfig = CONFIG
     """What the stages read of a fit of a shape; every sixth view is held out."""
     views, pixels, targets = capture(shape)
     held_out = np.arange(len(views)) % 6 == 0
-    training, unseen = (PixelPool(views, targets, np.flatnonzero(chosen)) for chosen in (~held_out, held_out))
+    training = PixelPool(views, targets, np.flatnonzero(~held_out))
+    split = [(np.flatnonzero(~held_out), np.flatnonzero(held_out))]
+    judges = [Judge(views, targets, splits, batch=config.radiance.batch)
+              for splits in (Judge.halves(len(views)), split)]
     return SimpleNamespace(scene=SimpleNamespace(subject=subject), views=views, pixels=pixels, config=config,
-                           training=training, held_out=unseen,
+                           training=training, judge=judges[0], held_out_judge=judges[1],
                            cell=lambda surface: surface.lattice.spacing * subject.length_scale)
 
 
