@@ -75,9 +75,11 @@ def fit_of(subject: mi.Shape, shape: trimesh.Trimesh, config: FitConfig = CONFIG
     views, pixels, targets = capture(shape)
     held_out = np.arange(len(views)) % 6 == 0
     training = PixelPool(views, targets, np.flatnonzero(~held_out))
-    judge = Judge(views, targets, Judge.halves(len(views)), batch=config.radiance.batch)
+    split = [(np.flatnonzero(~held_out), np.flatnonzero(held_out))]
+    judges = [Judge(views, targets, splits, batch=config.radiance.batch)
+              for splits in (Judge.halves(len(views)), split)]
     return SimpleNamespace(scene=SimpleNamespace(subject=subject), views=views, pixels=pixels, config=config,
-                           training=training, judge=judge,
+                           training=training, judge=judges[0], held_out_judge=judges[1],
                            cell=lambda surface: surface.lattice.spacing * subject.length_scale)
 
 
