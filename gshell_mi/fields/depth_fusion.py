@@ -34,9 +34,9 @@ def fused_distance(points: mi.Point3f, views: PinholeViews, depths: list[np.ndar
         One distance per point, world units. Where no view says anything it is ``-truncation``.
     """
     limit, count = dr.opaque(mi.Float, truncation), dr.width(points)
-    # Per point, how many views say at least each of some distances.
-    histogram = dr.zeros(mi.Float, count * (_LEVELS + 1))
-    lane = dr.arange(mi.UInt32, count) * (_LEVELS + 1)
+    # Per point and level between the truncations: how many views say so, and the sum of what they say.
+    numbers, sums = (dr.zeros(mi.Float, count * _LEVELS) for _ in range(2))
+    lane = dr.arange(mi.UInt32, count) * _LEVELS
     for index, depth in enumerate(depths):
         height, width = depth.shape
         film, along = views.project(index, points)
@@ -58,20 +58,17 @@ def fused_distance(points: mi.Point3f, views: PinholeViews, depths: list[np.ndar
         seen = dr.select(most - least < limit, between, least)
         vote = (seen - dr.norm(points - mi.Point3f(views.origins[index]))) / limit
         told = framed & (least >= 0) & (vote > -1)
-        level = mi.UInt32(dr.clip((vote + 1) * (0.5 * _LEVELS), 0, _LEVELS))
-        dr.scatter_reduce(dr.ReduceOp.Add, histogram, mi.Float(1), lane + level, told)
-        dr.eval(histogram)
-    total = mi.Float(0)
-    for level in range(_LEVELS + 1):
-        total += dr.gather(mi.Float, histogram, lane + level)
-    needed, above, found = share * total, mi.Float(0), -dr.full(mi.Float, 1, count)
-    open_ = total > 0
-    for level in reversed(range(_LEVELS + 1)):
-        here = dr.gather(mi.Float, histogram, lane + level)
-        reached = open_ & (above + here >= needed) & (here > 0)
-        part = dr.clip((needed - above) / dr.maximum(here, 1), 0, 1)
-        top = 1.0 if level == _LEVELS else 2 * (level + 1 - part) / _LEVELS - 1
-        found = dr.select(reached, dr.minimum(top, 1), found)
-        open_ &= ~reached
-        above += here
+        vote = dr.minimum(vote, 1)
+        level = mi.UInt32(dr.minimum((vote + 1) * (0.5 * _LEVELS), _LEVELS - 1))
+        dr.scatter_reduce(dr.ReduceOp.Add, numbers, mi.Float(1), lane + level, told)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, vote, lane + level, told)
+        dr.eval(numbers, sums)
+    here = [dr.gather(mi.Float, numbers, lane + level) for level in range(_LEVELS)]
+    total = sum(here, mi.Float(0))
+    above, found, sought = mi.Float(0), dr.full(mi.Float, -1, count), total > 0
+    for level in reversed(range(_LEVELS)):
+        above += here[level]
+        reached = sought & (above >= share * total) & (here[level] > 0)
+        mean = dr.gather(mi.Float, sums, lane + level) / dr.maximum(here[level], 1)
+        found, sought = dr.select(reached, mean, found), sought & ~reached
     return limit * found
