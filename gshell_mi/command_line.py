@@ -27,12 +27,12 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
                 given: list[str] | None, *, default: Arguments | None = None,
                 check: Callable[[list[str]], None] = lambda words: None,
                 interrupted: Callable[[Arguments], str] = lambda _: "Interrupted.") -> int:
-    """Parses the arguments, sets their Mitsuba variant and does the work.
+    """Parses the arguments, sets their Mitsuba variant, if they have one, and does the work.
 
     Args:
         name: the package that is the command, as in ``python -m gshell_mi.NAME``.
         description: one sentence for ``--help``.
-        arguments: a dataclass with a field ``variant``.
+        arguments: a dataclass; without a field ``variant`` no variant is set.
         work: what the command does; only now may it import modules that need a variant.
         given: the arguments; None: those of the process.
         default: values of the fields that are not given, in place of the dataclass's own;
@@ -50,9 +50,10 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
         parsed = parse() if default is None else parse(default=default)
         with Interrupt() as interrupt:
             try:
-                ensure_variant(parsed.variant)
-                if problem := kernel_cache_problem():
-                    print(f"warning: {problem}", file=sys.stderr)
+                if (variant := getattr(parsed, "variant", None)) is not None:
+                    ensure_variant(variant)
+                    if problem := kernel_cache_problem():
+                        print(f"warning: {problem}", file=sys.stderr)
                 interrupt.check()
                 work(parsed)
             except KeyboardInterrupt:
