@@ -18,8 +18,8 @@ SDF_CELLS = 3.0
 MSDF_CELLS = 2.0
 #: Cells between a mesh and the cube's faces, so that its template closes within.
 MARGIN_CELLS = 3.5
-#: The mSDF fades out where the signed distance, by its truncation, goes from this to 1. Edges that cross the
-#: surface end nearer: the longest is sqrt(3) cells.
+#: Beside the surface's edges the mSDF goes on as it was, and sinks to -1 where the signed distance, by its
+#: truncation, goes from this to 1.
 _FADE = 0.6
 
 
@@ -33,7 +33,7 @@ class TruncatedFields:
     sdf: np.ndarray
     """(N, N, N), 1 at ``SDF_CELLS`` cells or more outside of the template."""
     msdf: np.ndarray
-    """(N, N, N), >= 0 on the surface; 0 far from it."""
+    """(N, N, N), >= 0 on the surface; -1 far from it."""
 
     @property
     def side(self) -> int:
@@ -52,12 +52,13 @@ class TruncatedFields:
         shape = (side, side, side)
         sdf = np.clip(fields.sdf.reshape(shape) / (SDF_CELLS * cell), -1, 1)
         msdf = fields.msdf.reshape(shape)
+        msdf = np.clip(msdf / (MSDF_CELLS * cell), -1, 1)
         # What no crossing edge takes part in holds a constant there: it becomes what its neighbours are.
-        unused = msdf == np.float32(-cell)
+        unused = fields.msdf.reshape(shape) == np.float32(-cell)
         if unused.any() and not unused.all():
             nearest = ndimage.distance_transform_edt(unused, return_distances=False, return_indices=True)
-            msdf = msdf[tuple(nearest)]
-        msdf = np.clip(msdf / (MSDF_CELLS * cell), -1, 1) * np.clip((1 - np.abs(sdf)) / (1 - _FADE), 0, 1)
+            near = np.clip((1 - np.abs(sdf)) / (1 - _FADE), 0, 1)
+            msdf = np.where(unused, (msdf[tuple(nearest)] + 1) * near - 1, msdf)
         return cls(sdf.astype(np.float32), msdf.astype(np.float32))
 
     def surface(self, *, largest: bool = False) -> trimesh.Trimesh:
