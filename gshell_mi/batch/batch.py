@@ -71,8 +71,8 @@ def _run_all(waiting: deque[Job], done: dict[str, dict], results: str, address: 
         own = {} if address else {"num_cpus": cpus, "include_dashboard": False}
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
     except Exception as error:  # Ray raises whatever it stumbles over
-        raise UserError(f"There is no Ray cluster at '{address}' ({type(error).__name__}); start one with ray "
-                        f"start --head, or leave --address out.") from error
+        raise UserError(f"There is no Ray cluster at '{address}' ({type(error).__name__}); start one with "
+                        f"ray start --head, or leave --address out.") from error
     try:
         remote = ray.remote(max_retries=retries)(run_job)
         tries: dict[str, int] = {}
@@ -125,8 +125,8 @@ def _page(rows: list[dict]) -> str:
     """A table of results, the worst first."""
     body = "".join(
         f"<tr class='{row['status']}'><td>{html.escape(row['name'])}</td><td>{row['status']}</td>"
-        f"<td>{row.get('psnr', '')}</td><td>{row['seconds']}</td><td><pre>{html.escape(row['told'])}</pre></td>"
-        f"</tr>\n" for row in rows)
+        f"<td>{row.get('psnr', '')}</td><td>{row['seconds']}</td>"
+        f"<td><pre>{html.escape(row['told'])}</pre></td></tr>\n" for row in rows)
     return ("<!doctype html><meta charset='utf-8'><title>Results</title><style>body{font:14px sans-serif}"
             "td,th{padding:3px 10px;text-align:left;vertical-align:top}pre{margin:0;white-space:pre-wrap}"
             ".wrong,.failed{background:#fdd}</style><table><tr><th>job</th><th>status</th><th>PSNR (dB)</th>"

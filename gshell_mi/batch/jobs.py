@@ -39,9 +39,9 @@ class Job:
 def read_jobs(path: Path) -> list[Job]:
     """The jobs of a file with one JSON object per line.
 
-    ``{"name": "mug", "command": "fit", "arguments": ["mug.xml"], "cpus": 2}``; ``name``, ``cpus``, ``gpus`` and
-    ``memory_gib`` may be missing. ``{out}`` in an argument is the folder of the job's results; without it,
-    ``-o`` and that folder are added.
+    ``{"name": "mug", "command": "fit", "arguments": ["mug.xml"], "cpus": 2}``; ``name``, ``cpus``, ``gpus``
+    and ``memory_gib`` may be missing. ``{out}`` in an argument is the folder of the job's results; without
+    it, ``-o`` and that folder are added.
 
     Raises:
         UserError: the file is missing or empty, or a line of it is no job; the sentence tells which.
@@ -51,8 +51,8 @@ def read_jobs(path: Path) -> list[Job]:
     except FileNotFoundError:
         raise UserError(f"'{path}' does not exist; check the path.") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"'{path}' cannot be read as a file of jobs ({error}); give one with a JSON object per "
-                        f"line.") from error
+        raise UserError(f"'{path}' cannot be read as a file of jobs ({error}); give one with a JSON object "
+                        f"per line.") from error
     jobs = [_job(line, f"'{path}', line {number}", number)
             for number, line in enumerate(lines, 1) if line.strip()]
     if not jobs:

@@ -67,7 +67,8 @@ def converted(source: Source, side: int, *, most: float) -> Row:
 def round_trip(found: trimesh.Trimesh, true: trimesh.Trimesh) -> float:
     """Chamfer distance in per cent of the true one's diagonal, less what two samplings of one surface have:
     from points on either to the nearest triangle's plane near the nearest point of the other."""
-    both = [trimesh.sample.sample_surface(mesh, _CHECKED, seed=index) for index, mesh in enumerate((found, true))]
+    both = [trimesh.sample.sample_surface(mesh, _CHECKED, seed=index) for index, mesh in
+            enumerate((found, true))]
     distance = []
     for (points, _), (others, faces), mesh in ((both[0], both[1], true), (both[1], both[0], found)):
         gap, nearest = cKDTree(others).query(points)

@@ -122,7 +122,8 @@ class DataSet:
             parts.append((shard.sdf[chosen], shard.msdf[chosen], shard.points[chosen]))
         if not records:
             split = "held-out" if held_out else "training"
-            raise UserError(f"'{self.path}' has no {split} objects; make a larger set, or another --held-out.")
+            raise UserError(f"'{self.path}' has no {split} objects; make a larger set, or another "
+                            f"--held-out.")
         return records, *(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
 
 
@@ -166,7 +167,8 @@ def read_shard(path: Path, side: int) -> Shard:
         raise UserError(f"Shard '{path}' cannot be read ({type(error).__name__}); remove it and run the same "
                         f"gshell_mi.dataset command again, which makes it anew.") from error
     shape = (len(records), side, side, side)
-    if shard.sdf.shape != shape or shard.msdf.shape != shape or shard.points.shape != (len(records), POINTS, 3):
+    found = (shard.sdf.shape, shard.msdf.shape, shard.points.shape)
+    if found != (shape, shape, (len(records), POINTS, 3)):
         raise UserError(f"Shard '{path}' does not fit its set; remove it and run the same gshell_mi.dataset "
                         f"command again, which makes it anew.")
     if not (np.isfinite(shard.sdf).all() and np.isfinite(shard.msdf).all()):

@@ -21,6 +21,9 @@ BLOCK = 8
 #: Values of a block: two fields.
 BLOCK_VALUES = 2 * BLOCK**3
 
+#: The signed distance in blocks that are not stored: so small that an edge from a stored vertex crosses the
+#: surface, if it has to, at the far end, where the mSDF cuts it away.
+_FILLED = 0.01
 #: A coefficient of a crossing keeps so far from the ends of its edge.
 _END = 1e-3
 #: Magnitudes of neighbours differ by no more than this factor's logarithm, by which noise is kept in bounds.
@@ -137,7 +140,7 @@ def from_blocks(blocks: np.ndarray, values: np.ndarray, side: int) -> TruncatedF
         return TruncatedFields(sdf, msdf)
     missing = np.kron(unknown.reshape(*3 * (per_side,)), np.ones(3 * (BLOCK,), bool))
     nearest = ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
-    sdf = np.where(missing, np.copysign(1.0, sdf[tuple(nearest)]), sdf).astype(np.float32)
+    sdf = np.where(missing, np.copysign(_FILLED, sdf[tuple(nearest)]), sdf).astype(np.float32)
     return TruncatedFields(sdf, np.where(missing, np.float32(-1), msdf))
 
 
@@ -196,7 +199,7 @@ def _solved(row, a, b, weight_a, weight_b, right, importance, count: int) -> np.
 
 @dataclass(frozen=True)
 class Principal:
-    """Blocks by their leading principal components, divided by one scale: what the transformer's tokens are."""
+    """Blocks by their leading principal components, divided by one scale: the transformer's tokens."""
 
     mean: np.ndarray
     """(1024,)."""

@@ -65,7 +65,8 @@ def read_samples(folder: Path, points: int) -> Samples:
                    [row[3] for row in full], len(rows) - len(full), seconds)
 
 
-def evaluate(samples: Samples, data: DataSet, *, points: int = 512, emd: int = 32, quiet: bool = True) -> dict:
+def evaluate(samples: Samples, data: DataSet, *, points: int = 512, emd: int = 32,
+             quiet: bool = True) -> dict:
     """Scores of samples against the held-out objects of a data set.
 
     Distances are of the cube [-1, 1]^3, in which both lie. Both sets are cut to the size of the smaller. The

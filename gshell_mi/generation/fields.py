@@ -74,7 +74,8 @@ class TruncatedFields:
         sdf = np.array(self.sdf, np.float32)
         border = lattice.on_border().reshape(sdf.shape)
         sdf[border] = np.maximum(sdf[border], 0.1)  # the template closes inside the lattice
-        found = extract(lattice, mi.Float(sdf.ravel()), mi.Float(np.ascontiguousarray(self.msdf, np.float32).ravel()))
+        msdf = np.ascontiguousarray(self.msdf, np.float32)
+        found = extract(lattice, mi.Float(sdf.ravel()), mi.Float(msdf.ravel()))
         vertices, faces, _ = found.to_numpy()
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         return _without_crumbs(mesh) if largest and len(faces) else mesh

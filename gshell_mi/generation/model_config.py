@@ -53,7 +53,8 @@ class ModelConfig:
             config = cls(str(found["model"]), str(found["size"]), int(found["side"]),
                          tuple(str(name) for name in found["classes"]), int(found["components"]))
         except FileNotFoundError:
-            raise UserError(f"'{path.parent}' holds no model; train one with python -m gshell_mi.train.") from None
+            raise UserError(f"'{path.parent}' holds no model; train one with python -m "
+                            f"gshell_mi.train.") from None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"'{path}' is damaged ({error}); train the model again.") from error
         if config.model not in MODELS or config.size not in SIZES:

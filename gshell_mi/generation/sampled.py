@@ -135,5 +135,5 @@ def _write(folder: OwnFolder, fields: np.ndarray, kinds: list[str], seeds: list,
         there_and_back = [*pictures, *pictures[-2:0:-1]]
         write_video((frame / 255.0 for frame in there_and_back), folder.path / "interpolation.mp4", _FPS,
                     gif=False)
-    return (f"{folder.path}: {counted(len(fields), 'sample')} in {seconds:.1f} s ({seconds / len(fields):.2f} "
-            f"s each); see sheet.png")
+    return (f"{folder.path}: {counted(len(fields), 'sample')} in {seconds:.1f} s "
+            f"({seconds / len(fields):.2f} s each); see sheet.png")

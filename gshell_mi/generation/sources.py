@@ -99,7 +99,8 @@ def _of_place(place: Path) -> list[Source]:
     if place.is_file():
         return [Source(place.name, UNNAMED, str(place))] if place.suffix.lower() in MESH_FILES else []
     if _is_fit(place):
-        return [Source(place.name, UNNAMED, str(place / "mesh.ply"))] if (place / "mesh.ply").is_file() else []
+        path = place / "mesh.ply"
+        return [Source(place.name, UNNAMED, str(path))] if path.is_file() else []
     found = []
     fits = {path.parent for path in place.rglob(MARK) if _is_fit(path.parent)}
     for path in sorted(place.rglob("*")):

@@ -77,7 +77,8 @@ def _sewn(kind: str, parameters: dict[str, float], rng: np.random.Generator) -> 
     if len(faces) == 0 or np.abs(vertices).max() > 0.999:  # it leaves the lattice
         return None
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    folded = vertices + (_folds(vertices, parameters) + _wrinkles(vertices, rng))[:, None] * mesh.vertex_normals
+    height = _folds(vertices, parameters) + _wrinkles(vertices, rng)
+    folded = vertices + height[:, None] * mesh.vertex_normals
     return trimesh.Trimesh(_swayed(folded, rng), faces, process=False)
 
 

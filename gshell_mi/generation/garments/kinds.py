@@ -253,8 +253,8 @@ def _cape(p, given):
     down = dr.maximum(top - p.y, 0)
     # Round over the shoulders, then a cone.
     part = dr.clip(down / given["dome"], 0, 1)
-    radius = given["shoulder"] * dr.sqrt(dr.maximum(1 - dr.square(1 - part), 1e-6)) + given["flare"] * dr.power(
-        dr.maximum(down, 1e-4), given["curve"])
+    radius = given["shoulder"] * dr.sqrt(dr.maximum(1 - dr.square(1 - part), 1e-6))
+    radius += given["flare"] * dr.power(dr.maximum(down, 1e-4), given["curve"])
     s = smooth_cut(column(p, radius, given["depth"]), p.y - top, 0.06)
     neck = dr.norm(type(p)(p.x / given["neck_x"], (p.y - top) / given["neck_y"], p.z / given["neck_z"])) - 1
     cut = dr.minimum(neck * given["neck_x"],

@@ -6,6 +6,7 @@ data at t = 1; the times of training are logit-normal (Esser et al. 2024).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -50,8 +51,9 @@ class BlockFlow(nn.Module):
         # Blocks are told in cubes of two per side where they come in pairs, which makes fewer tokens.
         self.group = 2 if self.per_side % 2 == 0 else 1
         shape = {name: config.shape[name] for name in ("width", "depth", "heads")}
-        self.layout = TokenTransformer(self.group**3, self.per_side // self.group, len(config.classes), **shape)
-        self.content = TokenTransformer(config.components, self.per_side, len(config.classes), **shape)
+        classes = len(config.classes)
+        self.layout = TokenTransformer(self.group**3, self.per_side // self.group, classes, **shape)
+        self.content = TokenTransformer(config.components, self.per_side, classes, **shape)
         self.register_buffer("mean", torch.zeros(BLOCK_VALUES))
         self.register_buffer("basis", torch.zeros(BLOCK_VALUES, config.components))
         self.register_buffer("scale", torch.ones(()))
@@ -82,7 +84,8 @@ class BlockFlow(nn.Module):
         layout, count = data.layout[chosen], len(chosen)
         most = int(layout.sum(dim=1).max())
         tokens = torch.zeros(count, most, self.config.components)
-        place, present = torch.zeros(count, most, dtype=torch.long), torch.zeros(count, most, dtype=torch.bool)
+        place = torch.zeros(count, most, dtype=torch.long)
+        present = torch.zeros(count, most, dtype=torch.bool)
         for row, index in enumerate(chosen.tolist()):
             held = data.tokens[index]
             tokens[row, : len(held)] = held.float()
@@ -158,7 +161,8 @@ class BlockFlow(nn.Module):
         return result
 
     def _flow(self, network: TokenTransformer, noise: Tensor, place: Tensor, present: Tensor,
-              steering: Steering, goal: Tensor | None, known: Tensor | None, told: Callable[[], None]) -> Tensor:
+              steering: Steering, goal: Tensor | None, known: Tensor | None,
+              told: Callable[[], None]) -> Tensor:
         """From noise to data by Heun's method, the last step by Euler's.
 
         Args:
@@ -183,7 +187,7 @@ class BlockFlow(nn.Module):
             return x if known is None else torch.where(known, (1 - t) * noise + t * goal, x)
 
         x = noise if first == 0 else (1 - first) * noise + first * goal
-        for now, then in zip(times, times[1:], strict=False):
+        for now, then in itertools.pairwise(times):
             x = held(x, now)
             v = velocity(x, now)
             if then < 1:

@@ -32,7 +32,8 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor, condition: Tensor, mask: Tensor) -> Tensor:
         batch, tokens, width = x.shape
-        shift_a, scale_a, gate_a, shift_p, scale_p, gate_p = self.modulation(condition)[:, None].chunk(6, dim=2)
+        modulation = self.modulation(condition)[:, None].chunk(6, dim=2)
+        shift_a, scale_a, gate_a, shift_p, scale_p, gate_p = modulation
         normal = F.layer_norm(x, (width,)) * (1 + scale_a) + shift_a
         q, k, v = self.into(normal).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         seen = F.scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None, None])
