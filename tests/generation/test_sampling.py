@@ -58,7 +58,8 @@ def test_near_a_mesh_at_strength_0_is_that_mesh_in_its_place(tiny_model, tmp_pat
     bowl = trimesh.Trimesh(3 * ball.vertices + [5, 0, 0], ball.faces[ball.triangles_center[:, 2] < 0.5])
     bowl.export(tmp_path / "bowl.ply")
     assert main([str(tiny_model), "-o", str(tmp_path / "out"), "-n", "1",
-                 "--near", str(tmp_path / "bowl.ply"), "--strength", "0", "--steps", "2", "--device", "cpu", "--quiet", "--variant", variant]) == 0
+                 "--near", str(tmp_path / "bowl.ply"), "--strength", "0", "--steps", "2",
+                 "--device", "cpu", "--quiet", "--variant", variant]) == 0
     found = trimesh.load(tmp_path / "out" / "meshes" / "0000.ply", process=False)
     assert np.abs(np.linalg.norm(found.vertices - [5, 0, 0], axis=1) - 3).mean() < 0.1
 

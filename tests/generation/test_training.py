@@ -149,7 +149,8 @@ def test_a_missing_gpu_is_told(tiny_set, tmp_path, capsys):
 @pytest.mark.slow
 def test_a_killed_training_goes_on(tiny_set, tmp_path):
     command = [sys.executable, "-m", "gshell_mi.train", str(tiny_set), "-o", str(tmp_path / "m"),
-               "--size", "XS", "--steps", "100000", "--batch", "2", "--pictures", "0", "--device", "cpu", "--quiet"]
+               "--size", "XS", "--steps", "100000", "--batch",
+               "2", "--pictures", "0", "--device", "cpu", "--quiet"]
     process = subprocess.Popen(command)
     log = tmp_path / "m" / "log.jsonl"
     while not log.exists():
