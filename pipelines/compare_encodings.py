@@ -42,8 +42,8 @@ def main() -> None:
             kept.append(converted(source, given.side, most=1.0))
         except UserError as error:
             refused.append(f"{source.name}: {error}")
-    print(f"{len(kept)} of {given.garments} converted, {(time.process_time() - started) / given.garments:.2f} "
-          f"core seconds each; refused: {refused}")
+    seconds = (time.process_time() - started) / given.garments
+    print(f"{len(kept)} of {given.garments} converted, {seconds:.2f} core seconds each; refused: {refused}")
     meshes = [normalised(row.source.mesh()[0], given.side)[0] for row in kept]
 
     print("| encoding | numbers | chamfer, mean (%) | worst (%) | loops right (%) | decoding (s) |")

@@ -82,9 +82,10 @@ def _given(near: Path | None, complete: Path | None, side: int) -> tuple[np.ndar
 
 
 def near_points(points: np.ndarray, side: int, cells: float) -> np.ndarray:
-    """(N, N, N) bool: the grid's vertices, by ``[z, y, x]``, nearer to a point than to any that is not seen.
+    """(N, N, N) bool: the grid's vertices, by ``[z, y, x]``, within so many cells of the surface that was seen.
 
-    ``points`` has four columns: x, y, z and whether it was seen.
+    Args:
+        points: (n, 4): places on the surface, and 1 for those that were seen.
     """
     from scipy.spatial import cKDTree
 
@@ -92,7 +93,7 @@ def near_points(points: np.ndarray, side: int, cells: float) -> np.ndarray:
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     distance, nearest = cKDTree(points[:, :3]).query(np.stack([x, y, z], axis=-1).reshape(-1, 3))
     seen = points[nearest, 3] > 0.5
-    return (seen | (distance > cells * 2 / (side - 1))).reshape(side, side, side)
+    return (seen & (distance < cells * 2 / (side - 1))).reshape(side, side, side)
 
 
 def _write(folder: OwnFolder, fields: np.ndarray, kinds: list[str], seeds: list, back: np.ndarray,

@@ -68,7 +68,7 @@ def test_what_is_near_a_seen_point_is_held_and_what_is_near_an_unseen_one_is_not
     points = np.array([[-0.5, 0, 0, 1], [0.5, 0, 0, 0]])
     held = near_points(points, 17, 2.0)
     assert held[8, 8, 4] and not held[8, 8, 12]
-    assert held[0, 0, 16]  # nothing of the surface is there
+    assert not held[0, 0, 16]  # nothing of the surface is there, so something may come
 
 
 def test_samples_are_scored_against_the_held_out_part(samples, tiny_set, tmp_path, capsys):
@@ -111,3 +111,22 @@ def test_weights_of_another_model_are_told(tiny_model, tmp_path, capsys, variant
 def test_scores_of_what_are_no_samples_are_told(tiny_set, tmp_path, capsys):
     assert evaluate([str(tmp_path), str(tiny_set)]) == 2
     assert "holds no samples; make some with" in capsys.readouterr().err
+
+
+def test_a_view_sees_the_side_of_a_ball_that_faces_it(tmp_path):
+    from gshell_mi.generation.unseen import seen_points
+
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    world = trimesh.Trimesh(2 * ball.vertices + [1, 0, 0], ball.faces)
+    world.export(tmp_path / "mesh.ply")
+    (tmp_path / "scene.xml").write_text("""<scene version="3.0.0"><integrator type="path"/>
+<sensor type="perspective" id="view_000"><float name="fov" value="60"/>
+<transform name="to_world"><lookat origin="1,0,20" target="1,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film></sensor>
+<emitter type="constant" id="light"/><shape type="ply" id="subject"><string name="filename" value="mesh.ply"/>
+</shape></scene>""")
+    back = np.diag([2.0, 2, 2, 1])
+    back[0, 3] = 1
+    points = seen_points(tmp_path, ball, back)
+    assert points[points[:, 2] > 0.2, 3].mean() > 0.99
+    assert points[points[:, 2] < 0.0, 3].mean() < 0.01

@@ -22,6 +22,8 @@ from .transformer import TokenTransformer
 
 #: How often a class is left out in training, so that the model knows the mean over all.
 _DROPPED = 0.1
+#: A block is known where all is that is so near the surface, by the truncation.
+_NEAR = 0.5
 #: Blocks of which principal components are taken.
 _MOST_BLOCKS = 40_000
 
@@ -129,7 +131,8 @@ class BlockFlow(nn.Module):
             table, active = self._table(steering.start)
             start = (torch.from_numpy(table).to(device), torch.from_numpy(active).to(device))
         if steering.known is not None:
-            blocks = self._wholly(steering.known) & start[1].cpu().numpy()
+            far = np.abs(steering.start[0]) > _NEAR
+            blocks = self._wholly(steering.known | far) & active
             known_blocks = torch.from_numpy(blocks).to(device)
             known_layout = self._grouped(known_blocks[None].float())[0] > 0
         place, present = self._layout_places(count, device)
@@ -226,6 +229,6 @@ class BlockFlow(nn.Module):
         return self._codec().encode(values).astype(np.float32), active
 
     def _wholly(self, known: np.ndarray) -> np.ndarray:
-        """(blocks,) those known wholly."""
+        """(blocks,) those that are known everywhere."""
         split = known.reshape(*(x for _ in range(3) for x in (self.per_side, BLOCK)))
         return split.transpose(0, 2, 4, 1, 3, 5).reshape(self.per_side**3, -1).all(axis=1)
