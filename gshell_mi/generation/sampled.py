@@ -82,7 +82,7 @@ def _given(near: Path | None, complete: Path | None, side: int) -> tuple[np.ndar
 
 
 def near_points(points: np.ndarray, side: int, cells: float) -> np.ndarray:
-    """(N, N, N) bool: the grid's vertices, by ``[z, y, x]``, within so many cells of the surface that was seen.
+    """(N, N, N) bool: the grid's vertices, by ``[z, y, x]``, within some cells of the surface that was seen.
 
     Args:
         points: (n, 4): places on the surface, and 1 for those that were seen.

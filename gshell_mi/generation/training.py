@@ -20,7 +20,7 @@ from torch import distributed
 
 from ..errors import UserError
 from ..files import replacing
-from ..interrupt import check_interrupt
+from ..interrupt import check_interrupt, interrupts_held_back
 from ..own_folder import OwnFolder, own_folder
 from ..wording import counted
 from .data_set import DataSet
@@ -166,20 +166,22 @@ class _Training:
             bar = progress.add_task("", total=1.0, completed=self._share(), loss="")
             drawn = math.floor(self._share() * self.config.pictures)
             while not self.processes.agreed(self._share() >= 1):
-                began = time.perf_counter()
                 try:
                     check_interrupt()
-                    loss = self._take_step(forward, prepared)
+                    with interrupts_held_back():
+                        began = time.perf_counter()
+                        loss = self._take_step(forward, prepared)
+                        self.step += 1
+                        self.seconds += time.perf_counter() - began
+                        self._log({"step": self.step, "seconds": round(self.seconds, 3),
+                                   "loss": round(loss, 6)})
                 except KeyboardInterrupt:
                     self._save()
                     raise
-                self.step += 1
-                self.seconds += time.perf_counter() - began
                 smooth = loss if smooth is None else 0.98 * smooth + 0.02 * loss
                 progress.update(bar, completed=self._share(), loss=f"step {self.step}, loss {smooth:.4f}")
                 if self.folder is None:
                     continue
-                self._log({"step": self.step, "seconds": round(self.seconds, 3), "loss": round(loss, 6)})
                 if time.perf_counter() - saved > _SAVE_EVERY:
                     self._save()
                     saved = time.perf_counter()
@@ -280,6 +282,8 @@ class _Training:
             distributed.broadcast(value, 0)
 
     def _log(self, line: dict) -> None:
+        if self.folder is None:
+            return
         with open(self.folder.path / "log.jsonl", "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ..model_config import ModelConfig
-from .block_flow import BlockFlow
-from .dense_diffusion import DenseDiffusion
 from .steering import Steering
 
-__all__ = ["BlockFlow", "DenseDiffusion", "Steering", "make_model"]
+if TYPE_CHECKING:
+    from .block_flow import BlockFlow
+    from .dense_diffusion import DenseDiffusion
+
+__all__ = ["Steering", "make_model"]
 
 
 def make_model(config: ModelConfig) -> BlockFlow | DenseDiffusion:
     """The untrained model of a configuration."""
-    return {"blocks": BlockFlow, "unet": DenseDiffusion}[config.model](config)
+    if config.model == "unet":
+        from .dense_diffusion import DenseDiffusion  # MONAI takes seconds to import
+
+        return DenseDiffusion(config)
+    from .block_flow import BlockFlow
+
+    return BlockFlow(config)
