@@ -41,6 +41,12 @@ def run_batch(path: Path, output: Path, *, results: str | None = None, address: 
             done then.
     """
     jobs = read_jobs(path)
+    try:
+        import fsspec  # noqa: F401
+        import ray
+    except ImportError as error:
+        raise UserError(f"This needs {'fsspec' if error.name == 'fsspec' else 'Ray'}; install it with pip "
+                        f"install 'gshell_mi[ray]'.") from None
     output.mkdir(parents=True, exist_ok=True)
     with own_folder(output, "batch") as folder:
         folder.claim("batch.json", "results.jsonl", "results.html")
@@ -49,7 +55,7 @@ def run_batch(path: Path, output: Path, *, results: str | None = None, address: 
         waiting = deque(job for job in jobs if job.name not in done)
         _write(folder, "batch.json", json.dumps({"jobs": str(path), "results": results, "count": len(jobs)}))
         if waiting:
-            _run_all(waiting, done, results, address, retries, cpus, quiet)
+            _run_all(ray, waiting, done, results, address, retries, cpus, quiet)
         rows = [done[job.name] for job in jobs]
         rows.sort(key=lambda row: (row["status"] == "done", row.get("psnr", float("inf")), row["name"]))
         _write(folder, "results.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
@@ -61,12 +67,8 @@ def run_batch(path: Path, output: Path, *, results: str | None = None, address: 
     return f"{output}: {counted(len(rows), 'job')} done; see results.html"
 
 
-def _run_all(waiting: deque[Job], done: dict[str, dict], results: str, address: str | None, retries: int,
-             cpus: float | None, quiet: bool) -> None:
-    try:
-        import ray
-    except ImportError:
-        raise UserError("This needs Ray; install it with pip install 'gshell_mi[ray]'.") from None
+def _run_all(ray, waiting: deque[Job], done: dict[str, dict], results: str, address: str | None,
+             retries: int, cpus: float | None, quiet: bool) -> None:
     try:
         own = {} if address else {"num_cpus": cpus, "include_dashboard": False}
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)

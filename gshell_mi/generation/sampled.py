@@ -102,7 +102,10 @@ def _write(folder: OwnFolder, fields: np.ndarray, kinds: list[str], seeds: list,
     from ..export.ply import write_ply
 
     names = [f"meshes/{index:04d}.{suffix}" for index in range(len(fields))]
-    folder.claim("fields.npz", "samples.json", "sheet.png", *names)
+    written = ["fields.npz", "samples.json", "sheet.png", *(["interpolation.mp4"] if film else []), *names]
+    folder.check_free(written)
+    folder.clear()
+    folder.claim(*written)
     (folder.path / "meshes").mkdir(exist_ok=True)
     pictures, labels, told = [], [], []
     for index, (pair, kind, name) in enumerate(zip(fields, kinds, names, strict=True)):
@@ -132,7 +135,6 @@ def _write(folder: OwnFolder, fields: np.ndarray, kinds: list[str], seeds: list,
     if film:
         from ..turntable.video import write_video
 
-        folder.claim("interpolation.mp4")
         there_and_back = [*pictures, *pictures[-2:0:-1]]
         write_video((frame / 255.0 for frame in there_and_back), folder.path / "interpolation.mp4", _FPS,
                     gif=False)
