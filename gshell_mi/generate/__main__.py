@@ -20,7 +20,7 @@ class _Arguments:
     model: tyro.conf.Positional[Path]
     """Folder that python -m gshell_mi.train wrote."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder for the meshes; earlier ones of this command are replaced. Default: generated, in the model's."""
+    """Folder for the meshes; earlier ones are replaced. Default: generated, in the model's."""
     count: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 16
     """How many."""
     kind: Annotated[str | None, tyro.conf.arg(name="class")] = None
