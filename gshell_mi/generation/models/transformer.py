@@ -17,7 +17,11 @@ def time_features(t: Tensor, width: int) -> Tensor:
 
 
 class Block(nn.Module):
-    """Attention and a perceptron, each scaled, shifted and gated by the condition (Peebles and Xie 2023)."""
+    """Attention and a perceptron, each scaled, shifted and gated by the condition (Peebles and Xie 2023).
+
+    What the condition says is the same for all blocks but for a table each (Chen et al. 2024), which saves a
+    third of the weights.
+    """
 
     def __init__(self, width: int, heads: int):
         super().__init__()
@@ -26,13 +30,11 @@ class Block(nn.Module):
         self.out = nn.Linear(width, width)
         self.perceptron = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(approximate="tanh"),
                                         nn.Linear(4 * width, width))
-        self.modulation = nn.Linear(width, 6 * width)
-        nn.init.zeros_(self.modulation.weight)
-        nn.init.zeros_(self.modulation.bias)
+        self.modulation = nn.Parameter(torch.zeros(6, width))
 
     def forward(self, x: Tensor, condition: Tensor, mask: Tensor) -> Tensor:
         batch, tokens, width = x.shape
-        modulation = self.modulation(condition)[:, None].chunk(6, dim=2)
+        modulation = (condition + self.modulation)[:, :, None].unbind(dim=1)
         shift_a, scale_a, gate_a, shift_p, scale_p, gate_p = modulation
         normal = F.layer_norm(x, (width,)) * (1 + scale_a) + shift_a
         q, k, v = self.into(normal).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
@@ -59,11 +61,12 @@ class TokenTransformer(nn.Module):
         self.kind = nn.Embedding(classes + 1, width)
         self.condition = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
+        self.shared = nn.Linear(width, 6 * width)
         self.modulation = nn.Linear(width, 2 * width)
         self.out = nn.Linear(width, values)
         for table in (*self.place, self.kind):
             nn.init.normal_(table.weight, std=0.02)
-        for layer in (self.modulation, self.out):
+        for layer in (self.shared, self.modulation, self.out):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
@@ -81,7 +84,8 @@ class TokenTransformer(nn.Module):
         for axis, table in enumerate(self.place):
             h = h + table(place // self.per_side**axis % self.per_side)
         condition = F.silu(self.condition(time_features(t, self.width)) + self.kind(kind))
+        shared = self.shared(condition).view(len(x), 6, self.width)
         for block in self.blocks:
-            h = block(h, condition, present)
+            h = block(h, shared, present)
         shift, scale = self.modulation(condition)[:, None].chunk(2, dim=2)
         return self.out(F.layer_norm(h, (self.width,)) * (1 + scale) + shift)
