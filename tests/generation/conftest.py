@@ -25,8 +25,6 @@ def tiny_set(tmp_path_factory):
 @pytest.fixture(scope="session")
 def tiny_model(tiny_set, tmp_path_factory):
     """A transformer of the smallest size after a few steps: it knows next to nothing."""
-    from gshell_mi.generation.own_process import in_own_process
-
     output = tmp_path_factory.mktemp("model") / "model"
-    in_own_process(train_tiny, tiny_set, output, 20)
+    train_tiny(tiny_set, output, 20)
     return output

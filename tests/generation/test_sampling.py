@@ -11,8 +11,15 @@ pytest.importorskip("monai")
 
 from gshell_mi.generate.__main__ import main
 from gshell_mi.generate.evaluate import main as evaluate
+from gshell_mi.generation.request import _sample
 from gshell_mi.generation.sampled import near_points
 from gshell_mi.topology import topology
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Samples in this process: another takes seconds to import torch."""
+    monkeypatch.setattr("gshell_mi.generation.sampled.sampled_fields", _sample)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +43,7 @@ def test_samples_are_manifold_meshes_with_their_counts(samples):
     assert (samples / "sheet.png").is_file()
 
 
-def test_the_same_seed_gives_the_same_sample_whatever_else_is_asked(samples, tiny_model, tmp_path, variant):
+def test_the_same_seed_gives_the_same_sample_whatever_else_is_asked(samples, tiny_model, tmp_path, variant, here):
     assert main([str(tiny_model), "-o", str(tmp_path / "out"), "-n", "1", "--seed", "2", "--class", "bowl",
                  "--steps", "3", "--device", "cpu", "--format", "glb", "--quiet", "--variant", variant]) == 0
     first, again = (np.load(folder / "fields.npz")["fields"] for folder in (samples, tmp_path / "out"))
@@ -47,13 +54,13 @@ def test_the_same_seed_gives_the_same_sample_whatever_else_is_asked(samples, tin
         assert len(trimesh.load(tmp_path / "out" / told["file"], force="mesh").faces) == told["faces"]
 
 
-def test_an_interpolation_is_a_film(tiny_model, tmp_path, variant):
+def test_an_interpolation_is_a_film(tiny_model, tmp_path, variant, here):
     assert main([str(tiny_model), "-o", str(tmp_path / "out"), "-n", "3", "--interpolate", "1", "2",
                  "--steps", "2", "--device", "cpu", "--quiet", "--variant", variant]) == 0
     assert (tmp_path / "out" / "interpolation.mp4").stat().st_size > 500
 
 
-def test_near_a_mesh_at_strength_0_is_that_mesh_in_its_place(tiny_model, tmp_path, variant):
+def test_near_a_mesh_at_strength_0_is_that_mesh_in_its_place(tiny_model, tmp_path, variant, here):
     ball = trimesh.creation.icosphere(subdivisions=3)
     bowl = trimesh.Trimesh(3 * ball.vertices + [5, 0, 0], ball.faces[ball.triangles_center[:, 2] < 0.5])
     bowl.export(tmp_path / "bowl.ply")
@@ -98,7 +105,7 @@ def test_mistakes_are_told(arguments, sentence, tiny_model, tmp_path, capsys, va
     assert not (tmp_path / "out").exists()
 
 
-def test_weights_of_another_model_are_told(tiny_model, tmp_path, capsys, variant):
+def test_weights_of_another_model_are_told(tiny_model, tmp_path, capsys, variant, here):
     card = json.loads((tiny_model / "model.json").read_text())
     card["config"]["size"] = "S"
     (tmp_path / "m").mkdir()
