@@ -50,7 +50,8 @@ def run_batch(path: Path, output: Path, *, results: str | None = None, address: 
     output.mkdir(parents=True, exist_ok=True)
     with own_folder(output, "batch") as folder:
         folder.claim("batch.json", "results.jsonl", "results.html")
-        results = str((output / "jobs").absolute()) if results is None else results
+        if results is None or "://" not in results:  # workers may have another current folder
+            results = str(Path(results or output / "jobs").absolute())
         done = finished(results, jobs)
         waiting = deque(job for job in jobs if job.name not in done)
         _write(folder, "batch.json", json.dumps({"jobs": str(path), "results": results, "count": len(jobs)}))

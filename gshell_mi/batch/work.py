@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from .jobs import Job
+from .jobs import OUT, Job
 
 #: Written last, beside the results of a job that came to its end.
 DONE = "job.json"
 _KEPT_LINES = 20
+_PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
 
 
 def run_job(job: Job, results: str) -> dict:
@@ -72,14 +76,16 @@ def finished(results: str, jobs: list[Job]) -> dict[str, dict]:
 
 def _run(job: Job, out: Path) -> dict:
     arguments = job.filled_in(str(out))
-    if job.command == "fit" and out.is_dir():
+    if any(f"{OUT}/" in argument for argument in job.arguments):
+        out.mkdir(exist_ok=True)
+    elif job.command == "fit" and out.is_dir():
         arguments.append("--resume" if (out / "checkpoint.npz").is_file() else "--overwrite")
     environment = dict(os.environ)
     environment.setdefault("OPENBLAS_NUM_THREADS", "1")
     started = time.perf_counter()
     process = subprocess.run([sys.executable, "-m", f"gshell_mi.{job.command}", *arguments], text=True,
                              env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                             stderr=subprocess.PIPE, errors="replace")
+                             stderr=subprocess.PIPE, errors="replace", preexec_fn=_end_with_parent)
     code = process.returncode
     told = [line.strip() for line in process.stderr.splitlines() if line.strip()][-_KEPT_LINES:]
     found = {"name": job.name, "job": _identity(job), "code": code,
@@ -90,6 +96,12 @@ def _run(job: Job, out: Path) -> dict:
         return found | {"psnr": round(sum(scores) / len(scores), 3)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ZeroDivisionError):
         return found
+
+
+def _end_with_parent() -> None:
+    """A killed worker leaves no job behind that would write into the folder of its next try (Linux only)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _identity(job: Job) -> list[str]:

@@ -43,7 +43,7 @@ def test_samples_are_manifold_meshes_with_their_counts(samples):
     assert (samples / "sheet.png").is_file()
 
 
-def test_the_same_seed_gives_the_same_sample_whatever_else_is_asked(samples, tiny_model, tmp_path, variant, here):
+def test_a_seed_gives_the_same_sample_whatever_else_is_asked(samples, tiny_model, tmp_path, variant, here):
     assert main([str(tiny_model), "-o", str(tmp_path / "out"), "-n", "1", "--seed", "2", "--class", "bowl",
                  "--steps", "3", "--device", "cpu", "--format", "glb", "--quiet", "--variant", variant]) == 0
     first, again = (np.load(folder / "fields.npz")["fields"] for folder in (samples, tmp_path / "out"))
