@@ -1,7 +1,10 @@
 """Jobs by the file: what a line may say, what becomes of each, and what is done again."""
 
 import json
+import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
 
@@ -65,6 +68,30 @@ def test_results_go_to_any_storage_and_only_good_ends_count(tmp_path):
     (tmp_path / "there" / "a" / "job.json").write_text(json.dumps(told | {"status": "done"}))
     assert set(finished(f"file://{tmp_path}/there", [job])) == {"a"}
     assert finished(f"file://{tmp_path}/there", [Job("a", "report", ("other",))]) == {}  # another job by now
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its parent's end")
+def test_a_killed_worker_leaves_no_job_behind():
+    script = ("import subprocess\nfrom gshell_mi.batch.work import _end_with_parent\n"
+              "job = subprocess.Popen(['sleep', '600'], preexec_fn=_end_with_parent)\n"
+              "print(job.pid, flush=True)\njob.wait()\n")
+    worker = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    job = int(worker.stdout.readline())
+    assert _runs(job)
+    worker.kill()
+    worker.wait()
+    until = time.monotonic() + 20
+    while _runs(job) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert not _runs(job)
+
+
+def _runs(number: int) -> bool:
+    try:
+        state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
 
 
 class FakeRay:
