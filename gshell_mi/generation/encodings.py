@@ -14,7 +14,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import cg
 
 from ..errors import UserError
-from .fields import TruncatedFields
+from .fields import TruncatedFields, lattice_edges
 
 #: Vertices per side of a block.
 BLOCK = 8
@@ -65,7 +65,7 @@ class CubicEncoding:
         values[0, ::2, ::2, ::2] = np.where(fields.sdf < 0, -1, 1)
         values[1, ::2, ::2, ::2] = fields.msdf > 0
         sdf, msdf = fields.sdf.ravel(), fields.msdf.ravel()
-        for offset, a, b in _edges(n):
+        for offset, a, b in lattice_edges(n):
             crossing = (sdf[a] < 0) != (sdf[b] < 0)
             a, b = a[crossing], b[crossing]
             t = np.clip(sdf[a] / (sdf[a] - sdf[b]), _END, 1 - _END)
@@ -79,7 +79,7 @@ class CubicEncoding:
         inside = (values[0, ::2, ::2, ::2] < 0).ravel()
         kept = (values[1, ::2, ::2, ::2] > 0.5).ravel()
         found = []
-        for offset, a, b in _edges(n):
+        for offset, a, b in lattice_edges(n):
             crossing = inside[a] != inside[b]
             a, b = a[crossing], b[crossing]
             node = _node(a, n, offset)
@@ -167,20 +167,10 @@ def _near_surface(fields: TruncatedFields) -> np.ndarray:
     n = fields.side
     sdf, msdf = fields.sdf.ravel(), fields.msdf.ravel()
     near = np.zeros(n**3, bool)
-    for _, a, b in _edges(n):
+    for _, a, b in lattice_edges(n):
         crossing = ((sdf[a] < 0) != (sdf[b] < 0)) & ((msdf[a] > 0) | (msdf[b] > 0))
         near[a[crossing]] = near[b[crossing]] = True
     return near.reshape(n, n, n)
-
-
-def _edges(n: int):
-    """Of each of the 7 directions of Kuhn's edges: (dz, dy, dx), and the edges' ends by number."""
-    number = np.arange(n**3).reshape(n, n, n)
-    for step in range(1, 8):
-        offset = (step >> 2, step >> 1 & 1, step & 1)
-        low = number[tuple(slice(0, n - o) for o in offset)]
-        high = number[tuple(slice(o, n) for o in offset)]
-        yield offset, low.ravel(), high.ravel()
 
 
 def _node(vertex: np.ndarray, n: int, offset: tuple[int, int, int]) -> tuple[np.ndarray, ...]:

@@ -40,7 +40,7 @@ def require_torch() -> None:
     """Raises ``UserError`` where the extra is not installed."""
     from importlib.util import find_spec
 
-    missing = [name for name in ("torch", "monai", "safetensors") if find_spec(name) is None]
+    missing = [name for name in ("torch", "monai", "einops", "safetensors") if find_spec(name) is None]
     if missing:
         raise UserError(f"This needs {' and '.join(missing)}; install them with pip install "
                         f"'gshell_mi[generate]'.")

@@ -48,7 +48,8 @@ def seen_points(folder: Path, mesh: trimesh.Trimesh, back: np.ndarray) -> np.nda
         toward /= distance[:, None]
         side = np.sign(np.einsum("ij,ij->i", toward, normals[inside]))[:, None]
         origin = world[inside] + lift * side * normals[inside]
-        ray = mi.Ray3f(mi.Point3f(origin.T.astype(np.float32)), mi.Vector3f(toward.T.astype(np.float32)))
+        start, way = (np.ascontiguousarray(np.asarray(x).T, np.float32) for x in (origin, toward))
+        ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(way))
         ray.maxt = mi.Float(distance.astype(np.float32))
         seen[np.flatnonzero(inside)[~scene.ray_test(ray).numpy()]] = True
     return np.concatenate([points, seen[:, None]], axis=1)
