@@ -7,7 +7,7 @@ import trimesh
 from gshell_mi.errors import UserError
 from gshell_mi.generation.converted import converted, round_trip
 from gshell_mi.generation.encodings import BLOCK_VALUES, ENCODINGS, BlockEncoding, Principal
-from gshell_mi.generation.fields import TruncatedFields, normalised
+from gshell_mi.generation.fields import TRUNCATION_CELLS, TruncatedFields, lattice_edges, normalised
 from gshell_mi.generation.sources import Source
 from gshell_mi.topology import topology
 
@@ -49,6 +49,15 @@ def test_fields_are_truncated_and_stand_for_the_mesh(mesh, fields):
     again = fields.surface()
     assert counts(again) == (1, 1, 0)
     assert round_trip(again, mesh) < 0.3
+
+
+def test_no_field_leaps_where_the_template_is_not_even_at_its_caps(fields):
+    for _, a, b in lattice_edges(SIDE):
+        s, other = fields.sdf.ravel()[a], fields.sdf.ravel()[b]
+        # The longest edge has sqrt(3) cells, and from_mesh may move a layer by half of one.
+        assert np.abs(s - other).max() < 2.7 / TRUNCATION_CELLS
+    inside = fields.sdf < 0
+    assert (fields.msdf[inside] > 0.3).any() and (fields.msdf[inside] < -0.3).any()  # sheet and cap
 
 
 def test_a_closed_mesh_stays_closed():
