@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import tyro
 
@@ -14,13 +14,7 @@ from .interrupt import Interrupt
 from .kernel_cache import kernel_cache_problem
 from .streams import with_streams
 
-
-class _Arguments(Protocol):
-    @property
-    def variant(self) -> str: ...
-
-
-Arguments = TypeVar("Arguments", bound=_Arguments)
+Arguments = TypeVar("Arguments")
 
 
 def run_command(name: str, description: str, arguments: type[Arguments], work: Callable[[Arguments], None],
