@@ -31,7 +31,7 @@ class ModelConfig:
     side: int
     """Vertices per side of the grid."""
     classes: tuple[str, ...]
-    components: int = 64
+    components: int = 128
     """Principal components that a block keeps."""
 
     @property

@@ -61,7 +61,7 @@ class TrainConfig:
     """cpu, cuda, or auto: cuda if there is one."""
     pictures: int = 4
     """How often samples are drawn as it goes."""
-    components: int = 64
+    components: int = 128
     """Of blocks: principal components that each keeps."""
 
 

@@ -32,7 +32,7 @@ class _Arguments:
     """Objects per step, and per process under torchrun."""
     rate: float = 5e-4
     """Learning rate after the warm-up."""
-    components: int = 64
+    components: int = 128
     """Of blocks: principal components that each keeps."""
     seed: int = 0
     """Of weights, order and noise."""
