@@ -15,7 +15,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import distributed
 
 from ..errors import UserError
@@ -239,10 +239,10 @@ class _Training:
         told = {"step": str(self.step), "seconds": repr(self.seconds)}
         tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
         with replacing(self.folder.path / _CHECKPOINT) as partial:
-            save_file(tensors, partial, metadata=told)
+            partial.write_bytes(save(tensors, told))
         half = {name: value.detach().cpu().half().contiguous() for name, value in self.ema.items()}
         with replacing(self.folder.path / "weights.safetensors") as partial:
-            save_file(half, partial, metadata=told)
+            partial.write_bytes(save(half, told))
 
     def _resume(self) -> None:
         path = None if self.folder is None else self.folder.path / _CHECKPOINT
