@@ -9,6 +9,7 @@ import trimesh
 from PIL import Image, ImageDraw
 
 from ..files import replacing
+from .surface_points import surface_points
 
 _FRONT, _BACK = np.array([0.36, 0.55, 0.72]), np.array([0.93, 0.55, 0.20])  # back faces are orange
 _LIGHT = np.array([0.35, 0.65, 0.67])
@@ -27,7 +28,7 @@ def picture(mesh: trimesh.Trimesh, side: int = 128, *, azimuth: float = 0.5, ele
     area = max(float(mesh.area), 1e-9)
     scale = size / 2 / 1.3
     count = int(np.clip(6 * area * scale**2, 2_000, 400_000))
-    points, face = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    points, face = surface_points(mesh, count, seed)
     toward = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation),
                        np.cos(azimuth) * np.cos(elevation)])
     right = np.array([np.cos(azimuth), 0, -np.sin(azimuth)])

@@ -13,6 +13,7 @@ from ..topology import Topology, topology
 from ..wording import counted
 from .fields import TruncatedFields, normalised
 from .sources import Source
+from .surface_points import surface_points
 
 #: Points that a row keeps of its surface, for scores.
 POINTS = 2048
@@ -60,15 +61,14 @@ def converted(source: Source, side: int, *, most: float) -> Row:
         raise UserError(f"its fields are {chamfer:.2f} % of its size away from it, more than {most:g} %")
     if expected is not None and found.boundary_loops != expected:
         raise UserError(f"its fields have {counted(found.boundary_loops, 'boundary loop')}, not {expected}")
-    points, _ = trimesh.sample.sample_surface(mesh, POINTS, seed=0)
+    points, _ = surface_points(mesh, POINTS)
     return Row(source, stored, points, true.boundary_loops, chamfer, _alike(true, found))
 
 
 def round_trip(found: trimesh.Trimesh, true: trimesh.Trimesh) -> float:
     """Chamfer distance in per cent of the true one's diagonal, less what two samplings of one surface have:
     from points on either to the nearest triangle's plane near the nearest point of the other."""
-    both = [trimesh.sample.sample_surface(mesh, _CHECKED, seed=index) for index, mesh in
-            enumerate((found, true))]
+    both = [surface_points(mesh, _CHECKED, seed) for seed, mesh in enumerate((found, true))]
     distance = []
     for (points, _), (others, faces), mesh in ((both[0], both[1], true), (both[1], both[0], found)):
         gap, nearest = cKDTree(others).query(points)

@@ -124,7 +124,8 @@ class DataSet:
             split = "held-out" if held_out else "training"
             raise UserError(f"'{self.path}' has no {split} objects; make a larger set, or another "
                             f"--held-out.")
-        return records, *(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        sdf, msdf, points = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        return records, sdf, msdf, points
 
 
 def write_config(folder: OwnFolder, config: dict) -> None:

@@ -35,9 +35,11 @@ class Encoding(Protocol):
 
     def encode(self, fields: TruncatedFields) -> dict[str, np.ndarray]:
         """The numbers, by name."""
+        ...
 
     def decode(self, code: dict[str, np.ndarray], side: int) -> TruncatedFields:
         """Fields of N^3 = ``side``^3 vertices with the same surface, nearly."""
+        ...
 
 
 class DenseEncoding:

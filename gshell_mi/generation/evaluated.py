@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -24,6 +23,7 @@ from .set_scores import (
     minimum_matching_distance,
     nearest_neighbour_accuracy,
 )
+from .surface_points import surface_points
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def read_samples(folder: Path, points: int) -> Samples:
     full = [row for row in rows if row[4] > 0]
     if not full:
         raise UserError(f"All samples in '{folder}' are empty; train the model for longer.")
-    found = [trimesh.sample.sample_surface(read_mesh(folder / row[0]), points, seed=i)[0]
+    found = [surface_points(read_mesh(folder / row[0]), points, i)[0]
              for i, row in enumerate(full)]
     return Samples(np.array(found), [row[1] for row in full], [row[2] for row in full],
                    [row[3] for row in full], len(rows) - len(full), seconds)

@@ -94,7 +94,7 @@ def make_data_set(output: Path, places: list[Path], *, garments: int = 0, seed: 
 def _run(jobs: list[tuple], processes: int, variant: str, advance: Callable[[int], None]) -> None:
     if processes == 1 or len(jobs) < 2:
         for job in jobs:
-            _convert_shard(*job, advance)
+            _convert_shard(*job, advance=advance)
         return
     # Spawned, as a process that has used Dr.Jit must not be forked.
     with ProcessPoolExecutor(min(processes, len(jobs)), multiprocessing.get_context("spawn"),
@@ -117,7 +117,7 @@ def _begin(variant: str) -> None:
         dr.set_thread_count(1)  # the processes are what runs side by side
 
 
-def _convert_shard(path: Path, sources: list[Source], side: int, held_out: float, most: float,
+def _convert_shard(path: Path, sources: list[Source], side: int, held_out: float, most: float, *,
                    advance: Callable[[int], None] = lambda _: None) -> None:
     rows, rejected = [], []
     for source in sources:

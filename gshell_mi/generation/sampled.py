@@ -71,7 +71,9 @@ def generate(model: Path, output: Path, *, count: int = 16, kind: str | None = N
 def _given(near: Path | None, complete: Path | None, side: int) -> tuple[np.ndarray, np.ndarray | None,
                                                                          np.ndarray]:
     """Fields to start from, where they are known, and the matrix back to the world."""
-    place = near or complete
+    place = near if complete is None else complete
+    if place is None:
+        raise ValueError("there is nothing to start from")
     mesh, back = normalised(read_mesh(place / "mesh.ply" if place.is_dir() else place), side)
     fields = TruncatedFields.of_mesh(mesh, side)
     start = np.stack([fields.sdf, fields.msdf])

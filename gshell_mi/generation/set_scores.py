@@ -102,9 +102,12 @@ def jensen_shannon_divergence(a: np.ndarray, b: np.ndarray) -> float:
     >>> jensen_shannon_divergence(points, points), jensen_shannon_divergence(points, points + 1)
     (0.0, 1.0)
     """
-    cells = [np.ravel_multi_index(tuple(np.clip((points.reshape(-1, 3) + 1) / 2 * _JSD_CELLS, 0,
-             _JSD_CELLS - 1).astype(int).T), 3 * (_JSD_CELLS,)) for points in (a, b)]
-    p, q = (np.bincount(cell, minlength=_JSD_CELLS**3) / len(cell) for cell in cells)
+    def shares(points: np.ndarray) -> np.ndarray:
+        cell = np.clip((points.reshape(-1, 3) + 1) / 2 * _JSD_CELLS, 0, _JSD_CELLS - 1).astype(int)
+        number = cell @ np.array([1, _JSD_CELLS, _JSD_CELLS**2])
+        return np.bincount(number, minlength=_JSD_CELLS**3) / len(number)
+
+    p, q = shares(a), shares(b)
     mean = (p + q) / 2
 
     def divergence(of: np.ndarray) -> float:

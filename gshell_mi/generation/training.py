@@ -6,9 +6,11 @@ import json
 import math
 import os
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -27,6 +29,10 @@ from .data_set import DataSet
 from .model_config import ModelConfig
 from .models import Steering, make_model
 from .own_process import in_own_process
+
+if TYPE_CHECKING:
+    from .models.block_flow import BlockFlow
+    from .models.dense_diffusion import DenseDiffusion
 
 _CHECKPOINT = "checkpoint.safetensors"
 #: Seconds between checkpoints.
@@ -154,16 +160,17 @@ class _Training:
         self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=self.config.rate, betas=(0.9, 0.99),
                                            weight_decay=0.01)
         self._resume()
-        forward = self.model
+        forward: Callable[..., torch.Tensor] = self.model
         if self.processes.count > 1:
             forward = torch.nn.parallel.DistributedDataParallel(self.model)
         if device.type == "cuda":
-            forward = torch.compile(forward, dynamic=True)
+            forward = torch.compile(forward, dynamic=True)  # pyright: ignore[reportAssignmentType]
         columns = (TextColumn("training"), BarColumn(), TextColumn("{task.percentage:.0f} %"),
                    TimeRemainingColumn(), TextColumn("{task.fields[loss]}"))
         saved, smooth = time.perf_counter(), None
         with Progress(*columns, console=Console(stderr=True), disable=quiet) as progress:
-            bar = progress.add_task("", total=1.0, completed=self._share(), loss="")
+            bar = progress.add_task("", total=1.0, loss="")
+            progress.update(bar, completed=self._share())
             drawn = math.floor(self._share() * self.config.pictures)
             while not self.processes.agreed(self._share() >= 1):
                 try:
@@ -199,7 +206,7 @@ class _Training:
             return min(1.0, self.step / max(self.config.steps, 1))
         return min(1.0, self.seconds / max(60 * self.config.minutes, 1e-9))
 
-    def _take_step(self, forward: torch.nn.Module, prepared) -> float:
+    def _take_step(self, forward: Callable[..., torch.Tensor], prepared) -> float:
         # All chance is drawn anew for each step from its number, so that a resumed run sees the same.
         number = (self.config.seed * 1_000_003 + self.step) * self.processes.count + self.processes.rank
         generator = torch.Generator().manual_seed(number)
@@ -289,8 +296,8 @@ class _Training:
 
     def _cut_log(self) -> None:
         """Takes out the lines of steps that are taken again."""
-        path = self.folder.path / "log.jsonl"
-        if not path.is_file():
+        path = None if self.folder is None else self.folder.path / "log.jsonl"
+        if path is None or not path.is_file():
             return
         lines = path.read_text(encoding="utf-8").splitlines()[: self.step]
         with replacing(path) as partial:
@@ -298,6 +305,8 @@ class _Training:
 
     def _draw(self) -> None:
         """A page of samples of the mean weights."""
+        if self.folder is None:
+            return
         kept = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
         self.model.load_state_dict(self.ema)
         self.model.eval()
@@ -331,7 +340,7 @@ def _write_card(output: Path, made: ModelConfig, config: TrainConfig, data: Data
         partial.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
 
-def load_model(folder: Path, device: torch.device) -> torch.nn.Module:
+def load_model(folder: Path, device: torch.device) -> BlockFlow | DenseDiffusion:
     """The trained model of a folder.
 
     Raises:

@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from ..export.fitted_scene import load_fitted_scene
+from .surface_points import surface_points
 
 _POINTS = 20_000
 #: A point is lifted off the surface by this fraction of the box before it looks for the camera.
@@ -27,7 +28,7 @@ def seen_points(folder: Path, mesh: trimesh.Trimesh, back: np.ndarray) -> np.nda
         UserError: the folder holds no fit.
     """
     scene = load_fitted_scene(folder)
-    points, face = trimesh.sample.sample_surface(mesh, _POINTS, seed=0)
+    points, face = surface_points(mesh, _POINTS)
     world = points @ back[:3, :3].T + back[:3, 3]
     normals = mesh.face_normals[face]
     seen = np.zeros(len(points), bool)

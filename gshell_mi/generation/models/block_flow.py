@@ -46,6 +46,10 @@ class Prepared:
 class BlockFlow(nn.Module):
     """Two transformers: ``layout`` for which blocks there are, ``content`` for what is in them."""
 
+    mean: Tensor
+    basis: Tensor
+    scale: Tensor
+
     def __init__(self, config: ModelConfig):
         super().__init__()
         self.config = config
@@ -126,13 +130,15 @@ class BlockFlow(nn.Module):
             told: called after each step, of which there are ``2 steering.steps``.
         """
         device, count = self.mean.device, len(steering.kinds)
-        start = known_layout = known_blocks = None
+        start = known_layout = known_blocks = near = None
         if steering.start is not None:
-            table, active = self._table(steering.start)
-            start = (torch.from_numpy(table).to(device), torch.from_numpy(active).to(device))
+            table, near = self._table(steering.start)
+            start = (torch.from_numpy(table).to(device), torch.from_numpy(near).to(device))
         if steering.known is not None:
+            if steering.start is None or near is None:
+                raise ValueError("nothing is known where there is no start")
             far = np.abs(steering.start[0]) > _NEAR
-            blocks = self._wholly(steering.known | far) & active
+            blocks = self._wholly(steering.known | far) & near
             known_blocks = torch.from_numpy(blocks).to(device)
             known_layout = self._grouped(known_blocks[None].float())[0] > 0
         place, present = self._layout_places(count, device)
@@ -187,9 +193,11 @@ class BlockFlow(nn.Module):
             return without + steering.guidance * (with_kind - without)
 
         def held(x: Tensor, t: float) -> Tensor:
-            return x if known is None else torch.where(known, (1 - t) * noise + t * goal, x)
+            if known is None or goal is None:
+                return x
+            return torch.where(known, (1 - t) * noise + t * goal, x)
 
-        x = noise if first == 0 else (1 - first) * noise + first * goal
+        x = noise if goal is None else (1 - first) * noise + first * goal
         for now, then in itertools.pairwise(times):
             x = held(x, now)
             v = velocity(x, now)
@@ -231,4 +239,5 @@ class BlockFlow(nn.Module):
     def _wholly(self, known: np.ndarray) -> np.ndarray:
         """(blocks,) those that are known everywhere."""
         split = known.reshape(*(x for _ in range(3) for x in (self.per_side, BLOCK)))
-        return split.transpose(0, 2, 4, 1, 3, 5).reshape(self.per_side**3, -1).all(axis=1)
+        blocks = split.transpose(0, 2, 4, 1, 3, 5).reshape(self.per_side**3, -1)
+        return np.asarray(blocks.all(axis=1))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from monai.networks.nets import DiffusionModelUNet
+from monai.networks.nets.diffusion_model_unet import DiffusionModelUNet
 from torch import Tensor, nn
 
 from ..model_config import ModelConfig
@@ -37,6 +37,8 @@ class Prepared:
 
 class DenseDiffusion(nn.Module):
     """A U-Net on both truncated distances."""
+
+    signal: Tensor
 
     def __init__(self, config: ModelConfig):
         super().__init__()
@@ -86,6 +88,8 @@ class DenseDiffusion(nn.Module):
         steps = torch.linspace((_TIMES - 1) * strength, 0, 2 * steering.steps).round().long().tolist()
 
         def noisy(step: int) -> Tensor:
+            if goal is None:
+                return noise
             return self.signal[step].sqrt() * goal + (1 - self.signal[step]).sqrt() * noise
 
         x = noise if strength == 1 else noisy(steps[0]).expand_as(noise)
@@ -103,6 +107,6 @@ class DenseDiffusion(nn.Module):
             after = self.signal[then] if then >= 0 else torch.ones_like(signal)
             x = after.sqrt() * clean + (1 - after).sqrt() * found
             told()
-        if known is not None:
+        if known is not None and goal is not None:
             x = torch.where(known, goal, x)
         return x.cpu().numpy()

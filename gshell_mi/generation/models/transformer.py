@@ -65,7 +65,7 @@ class TokenTransformer(nn.Module):
         self.modulation = nn.Linear(width, 2 * width)
         self.out = nn.Linear(width, values)
         for table in (*self.place, self.kind):
-            nn.init.normal_(table.weight, std=0.02)
+            nn.init.normal_(table.get_parameter("weight"), std=0.02)
         for layer in (self.shared, self.modulation, self.out):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
