@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import json
 import os
-import signal
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+from ..lifetime import end_with_parent
 from .jobs import OUT, Job
 
 #: Written last, beside the results of a job that came to its end.
 DONE = "job.json"
 _KEPT_LINES = 20
-_PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
 
 
 def run_job(job: Job, results: str) -> dict:
@@ -85,7 +82,7 @@ def _run(job: Job, out: Path) -> dict:
     started = time.perf_counter()
     process = subprocess.run([sys.executable, "-m", f"gshell_mi.{job.command}", *arguments], text=True,
                              env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                             stderr=subprocess.PIPE, errors="replace", preexec_fn=_end_with_parent)
+                             stderr=subprocess.PIPE, errors="replace", preexec_fn=end_with_parent)
     code = process.returncode
     told = [line.strip() for line in process.stderr.splitlines() if line.strip()][-_KEPT_LINES:]
     found = {"name": job.name, "job": _identity(job), "code": code,
@@ -96,12 +93,6 @@ def _run(job: Job, out: Path) -> dict:
         return found | {"psnr": round(sum(scores) / len(scores), 3)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ZeroDivisionError):
         return found
-
-
-def _end_with_parent() -> None:
-    """A killed worker leaves no job behind that would write into the folder of its next try (Linux only)."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _identity(job: Job) -> list[str]:

@@ -20,6 +20,7 @@ from ..doctor import ensure_variant
 from ..errors import UserError
 from ..files import replacing
 from ..interrupt import check_interrupt
+from ..lifetime import end_with_parent
 from ..own_folder import OwnFolder, own_folder
 from ..wording import counted
 from .contact_sheet import picture, write_sheet
@@ -112,6 +113,7 @@ def _run(jobs: list[tuple], processes: int, variant: str, advance: Callable[[int
 def _begin(variant: str) -> None:
     import drjit as dr
 
+    end_with_parent()
     ensure_variant(variant)
     if variant.startswith("llvm"):
         dr.set_thread_count(1)  # the processes are what runs side by side

@@ -10,6 +10,7 @@ from typing import Any
 
 from ..doctor import ensure_variant
 from ..errors import UserError
+from ..lifetime import end_with_parent
 
 
 def in_own_process(work: Callable, *arguments: Any, variant: str | None = None) -> Any:
@@ -32,6 +33,7 @@ def in_own_process(work: Callable, *arguments: Any, variant: str | None = None) 
 
 
 def _begin(variant: str | None) -> None:
+    end_with_parent()
     if variant is not None:
         ensure_variant(variant)
 

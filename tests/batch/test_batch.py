@@ -72,8 +72,8 @@ def test_results_go_to_any_storage_and_only_good_ends_count(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its parent's end")
 def test_a_killed_worker_leaves_no_job_behind():
-    script = ("import subprocess\nfrom gshell_mi.batch.work import _end_with_parent\n"
-              "job = subprocess.Popen(['sleep', '600'], preexec_fn=_end_with_parent)\n"
+    script = ("import subprocess\nfrom gshell_mi.lifetime import end_with_parent\n"
+              "job = subprocess.Popen(['sleep', '600'], preexec_fn=end_with_parent)\n"
               "print(job.pid, flush=True)\njob.wait()\n")
     worker = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
     job = int(worker.stdout.readline())
