@@ -22,7 +22,7 @@ def write_jobs(path, *jobs):
 
 def wrong(name):
     """A job that ends at once, with a mistake in its input."""
-    return {"name": name, "command": "report", "arguments": ["missing"]}
+    return {"name": name, "command": "turntable", "arguments": ["missing"]}
 
 
 def test_lines_become_jobs(tmp_path):
@@ -31,6 +31,7 @@ def test_lines_become_jobs(tmp_path):
     assert jobs[0] == Job("000001-fit", "fit", ("a.xml",), cpus=2.0)
     assert jobs[0].filled_in("/o") == ["a.xml", "-o", "/o"]
     assert jobs[1].filled_in("/o") == ["/o/x"] and jobs[1].gpus == 0.5
+    assert Job("c", "report", ("fit",)).filled_in("/o") == ["fit"]  # it has no -o
 
 
 @pytest.mark.parametrize(("line", "sentence"), [
@@ -52,7 +53,7 @@ def test_mistakes_in_the_file_are_told(line, sentence, tmp_path):
 
 
 def test_a_job_leaves_its_files_and_what_became_of_it(tmp_path):
-    found = run_job(Job("a", "report", ("missing",)), str(tmp_path))
+    found = run_job(Job("a", "turntable", ("missing",)), str(tmp_path))
     assert (found["status"], found["code"]) == ("wrong", 2)
     assert "missing" in found["told"] and "Traceback" not in found["told"]
     assert json.loads((tmp_path / "a" / "job.json").read_text()) == found
@@ -60,14 +61,14 @@ def test_a_job_leaves_its_files_and_what_became_of_it(tmp_path):
 
 def test_results_go_to_any_storage_and_only_good_ends_count(tmp_path):
     pytest.importorskip("fsspec")
-    job = Job("a", "report", ("missing",))
+    job = Job("a", "turntable", ("missing",))
     run_job(job, f"file://{tmp_path}/there")
     told = json.loads((tmp_path / "there" / "a" / "job.json").read_text())
     assert told["status"] == "wrong"
     assert finished(f"file://{tmp_path}/there", [job]) == {}
     (tmp_path / "there" / "a" / "job.json").write_text(json.dumps(told | {"status": "done"}))
     assert set(finished(f"file://{tmp_path}/there", [job])) == {"a"}
-    assert finished(f"file://{tmp_path}/there", [Job("a", "report", ("other",))]) == {}  # another job by now
+    assert finished(f"file://{tmp_path}/there", [Job("a", "turntable", ("other",))]) == {}  # another job by now
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its parent's end")
