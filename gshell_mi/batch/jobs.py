@@ -33,7 +33,7 @@ class Job:
         """Its arguments, with the folder of results in place."""
         if any(OUT in argument for argument in self.arguments):
             return [argument.replace(OUT, out) for argument in self.arguments]
-        if self.command in ("export", "report"):  # they write into the fit's folder
+        if self.command in ("export", "report"):  # into the fit's
             return list(self.arguments)
         return [*self.arguments, "-o", out]
 

@@ -68,7 +68,7 @@ def test_results_go_to_any_storage_and_only_good_ends_count(tmp_path):
     assert finished(f"file://{tmp_path}/there", [job]) == {}
     (tmp_path / "there" / "a" / "job.json").write_text(json.dumps(told | {"status": "done"}))
     assert set(finished(f"file://{tmp_path}/there", [job])) == {"a"}
-    assert finished(f"file://{tmp_path}/there", [Job("a", "turntable", ("other",))]) == {}  # another job by now
+    assert finished(f"file://{tmp_path}/there", [Job("a", "turntable", ("other",))]) == {}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its parent's end")
