@@ -16,10 +16,12 @@ The rooms, in the order in which data flows through them:
 - ``viewer``: a look at it while it runs, ``--viewer``
 - ``images``, ``topology``, ``export``, ``turntable``, ``report``: what it leaves behind
 - ``evaluation``, ``compare``: how good it is
+- ``generation``: models that learn such surfaces and make new ones; ``dataset``, ``train``, ``generate``
+- ``batch``: many commands, on many machines
 - ``scene_files``, ``scene_inputs``, ``float_images``, ``environment_maps``, ``mesh_files``, ``json_files``:
   files that anybody may have written, read with care
-- ``command_line``, ``streams``, ``interrupt``, ``errors``, ``files``, ``own_folder``, ``memory``: what the
-  commands share; ``doctor``: whether this machine can run it all
+- ``command_line``, ``streams``, ``interrupt``, ``errors``, ``files``, ``own_folder``, ``lifetime``,
+  ``memory``: what the commands share; ``doctor``: whether this machine can run it all
 - ``arrays``: names of Dr.Jit arrays in annotations
 - ``compat``, ``plugins``: what depends on Mitsuba's version, and how its plugins are registered
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import tyro
 
@@ -14,25 +14,19 @@ from .interrupt import Interrupt
 from .kernel_cache import kernel_cache_problem
 from .streams import with_streams
 
-
-class _Arguments(Protocol):
-    @property
-    def variant(self) -> str: ...
-
-
-Arguments = TypeVar("Arguments", bound=_Arguments)
+Arguments = TypeVar("Arguments")
 
 
 def run_command(name: str, description: str, arguments: type[Arguments], work: Callable[[Arguments], None],
                 given: list[str] | None, *, default: Arguments | None = None,
                 check: Callable[[list[str]], None] = lambda words: None,
                 interrupted: Callable[[Arguments], str] = lambda _: "Interrupted.") -> int:
-    """Parses the arguments, sets their Mitsuba variant and does the work.
+    """Parses the arguments, sets their Mitsuba variant, if they have one, and does the work.
 
     Args:
         name: the package that is the command, as in ``python -m gshell_mi.NAME``.
         description: one sentence for ``--help``.
-        arguments: a dataclass with a field ``variant``.
+        arguments: a dataclass; without a field ``variant`` no variant is set.
         work: what the command does; only now may it import modules that need a variant.
         given: the arguments; None: those of the process.
         default: values of the fields that are not given, in place of the dataclass's own;
@@ -50,9 +44,10 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
         parsed = parse() if default is None else parse(default=default)
         with Interrupt() as interrupt:
             try:
-                ensure_variant(parsed.variant)
-                if problem := kernel_cache_problem():
-                    print(f"warning: {problem}", file=sys.stderr)
+                if (variant := getattr(parsed, "variant", None)) is not None:
+                    ensure_variant(variant)
+                    if problem := kernel_cache_problem():
+                        print(f"warning: {problem}", file=sys.stderr)
                 interrupt.check()
                 work(parsed)
             except KeyboardInterrupt:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 from .streams import leave
@@ -49,6 +51,22 @@ class Interrupt:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self._pending = True
         signal.default_int_handler(number, frame)
+
+
+@contextmanager
+def interrupts_held_back() -> Iterator[None]:
+    """Context whose work Ctrl-C does not cut in two: the ``KeyboardInterrupt`` comes at its end."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came = []
+    previous = signal.signal(signal.SIGINT, lambda *given: came.append(given))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    if came and callable(previous):
+        previous(*came[0])
 
 
 def check_interrupt() -> None:

@@ -29,6 +29,12 @@ KINDS = {
             "mesh_roughness.png", "mesh_metallic.png", "mesh_normal.png", "remeshed.ply", "views/*.png"),
     "capture": ("sensors.xml", "test.xml", "capture.json", "check.png", "light.*", "view_*.exr",
                 "test/test_*.exr"),
+    "dataset": ("dataset.json", "statistics.json", "sheet.png", "shards/*.npz"),
+    "model": ("model.json", "weights.safetensors", "checkpoint.safetensors", "log.jsonl", "codec.npz",
+              "samples/*.png"),
+    "generate": ("samples.json", "sheet.png", "fields.npz", "interpolation.mp4", "interpolation.gif",
+                 "meshes/*.ply", "meshes/*.glb"),
+    "batch": ("batch.json", "results.jsonl", "results.html"),
 }
 
 #: Bytes at either end of a file in which its tag is looked for.

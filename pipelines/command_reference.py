@@ -11,12 +11,14 @@ import dataclasses
 import importlib
 import inspect
 import itertools
+import re
 import sys
 import textwrap
 import typing
 from pathlib import Path
 
-COMMANDS = ("capture", "fit", "export", "turntable", "compare", "report")
+COMMANDS = ("capture", "fit", "export", "turntable", "compare", "report", "dataset", "train", "generate",
+            "generate.evaluate", "batch")
 PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 
 _INTRODUCTION = """\
@@ -33,7 +35,8 @@ def reference() -> str:
     """The whole page."""
     sections = [_INTRODUCTION]
     for command in COMMANDS:
-        module = importlib.import_module(f"gshell_mi.{command}.__main__")
+        inner = command if "." in command else f"{command}.__main__"
+        module = importlib.import_module(f"gshell_mi.{inner}")
         title = module.__doc__.splitlines()[0].split(": ", 1)[1]
         sections.append(f"## `python -m gshell_mi.{command}`\n\n{title[0].upper()}{title[1:]}\n\n"
                         + "\n\n".join(_tables(module._Arguments)) + "\n")
@@ -61,9 +64,10 @@ def _tables(arguments: type, prefix: str = "") -> list[str]:
 
 
 def _row(field: dataclasses.Field, metadata: str, prefix: str, text: str) -> str:
-    name = "--" + f"{prefix}{field.name}".replace("_", "-")
-    if "-o" in metadata:
-        name = f"-o, {name}"
+    renamed = re.search(r"\bname='(\w+)'", metadata)
+    name = "--" + f"{prefix}{renamed[1] if renamed else field.name}".replace("_", "-")
+    if short := re.search(r"'(-\w)'", metadata):
+        name = f"{short[1]}, {name}"
     if "positional" in metadata.lower():
         name = field.name.upper()
     return f"| `{name}` | {_default(field)} | {text} |"

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from gshell_mi.interrupt import Interrupt
+from gshell_mi.interrupt import Interrupt, interrupts_held_back
 
 
 @pytest.fixture(autouse=True)
@@ -55,3 +55,14 @@ def test_in_a_thread_it_does_nothing():
     thread.start()
     thread.join()
     assert done
+
+
+def test_work_that_is_held_together_ends_before_the_interrupt():
+    steps = []
+    with Interrupt() as interrupt, pytest.raises(KeyboardInterrupt):
+        with interrupts_held_back():
+            signal.raise_signal(signal.SIGINT)
+            steps.append("rest")
+        steps.append("after")
+    assert steps == ["rest"] and interrupt.pending
+    assert signal.getsignal(signal.SIGINT) is not None

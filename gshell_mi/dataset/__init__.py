@@ -1,0 +1,1 @@
+"""``python -m gshell_mi.dataset``: meshes, fits or generated garments become a data set."""

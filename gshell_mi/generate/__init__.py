@@ -1,0 +1,1 @@
+"""``python -m gshell_mi.generate``: new open meshes from a trained model."""

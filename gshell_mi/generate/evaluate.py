@@ -1,0 +1,76 @@
+"""``python -m gshell_mi.generate.evaluate``: scores of samples against the held-out part of a data set."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from ..command_line import run_command
+from ..errors import UserError
+from ..files import replacing
+
+_MEANINGS = {
+    "mmd": "mean distance from a true shape to the nearest sample",
+    "coverage": "true shapes that are nearest to some sample",
+    "nearest_neighbour_accuracy": "0.5: nothing tells samples from true shapes",
+    "jsd": "divergence of where points lie, in bits",
+    "nearest_training": "mean distance from a sample to the nearest training shape",
+    "nearest_training_of_true": "the same of held-out shapes: much less above is memory",
+    "loops_as_class": "samples with as many loops as some object of their class",
+    "one_component": "samples in one piece",
+}
+
+
+@dataclass(frozen=True)
+class _Arguments:
+    samples: tyro.conf.Positional[Path]
+    """Folder that python -m gshell_mi.generate wrote."""
+    data_set: tyro.conf.Positional[Path]
+    """The data set that the model was trained on."""
+    points: int = 512
+    """Of each shape, up to 2048."""
+    emd: int = 32
+    """Shapes of each set for the earth mover's distance; 0 for none."""
+    json: Path | None = None
+    """File for the scores."""
+    quiet: bool = False
+    """No progress bar."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    return run_command("generate.evaluate", "Score samples against a data set.", _Arguments, _evaluate,
+                       arguments)
+
+
+def _evaluate(given: _Arguments) -> None:
+    from ..generation.data_set import DataSet
+    from ..generation.evaluated import evaluate, read_samples
+
+    if not given.samples.exists():
+        raise UserError(f"'{given.samples}' does not exist; check the path.")
+    if not 16 <= given.points <= 2048:
+        raise UserError(f"--points must be from 16 to 2048, not {given.points}.")
+    if given.emd < 0:
+        raise UserError(f"--emd must not be negative, but is {given.emd}.")
+    data = DataSet.open(given.data_set)
+    scores = evaluate(read_samples(given.samples, given.points), data, points=given.points, emd=given.emd,
+                      quiet=given.quiet)
+    if given.json:
+        with replacing(given.json) as partial:
+            partial.write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
+    table = Table("score", "", "")
+    for name, value in scores.items():
+        shown = "" if value is None else f"{value:.4f}" if isinstance(value, float) else str(value)
+        table.add_row(name, shown, _MEANINGS.get(name, ""))
+    Console(highlight=False).print(table)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

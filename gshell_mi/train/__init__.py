@@ -1,0 +1,1 @@
+"""``python -m gshell_mi.train``: a generative model learns a data set."""

@@ -1,0 +1,83 @@
+"""What each encoding of generated garments loses: the table of docs/generation.md.
+
+    python pipelines/compare_encodings.py [--garments 100] [--side 64] [--seed 1]
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+
+from gshell_mi.doctor import ensure_variant
+from gshell_mi.errors import UserError
+from gshell_mi.generation.converted import converted, round_trip
+from gshell_mi.generation.encodings import ENCODINGS, BlockEncoding, Principal, from_blocks
+from gshell_mi.generation.fields import TruncatedFields, normalised
+from gshell_mi.generation.sources import garment_sources
+from gshell_mi.topology import topology
+
+
+@dataclass(frozen=True)
+class _Arguments:
+    garments: int = 100
+    """How many."""
+    side: int = 64
+    """Vertices per side of the grid."""
+    seed: int = 1
+    """Of the garments."""
+    components: tuple[int, ...] = (32, 64, 128)
+    """Principal components of blocks to try."""
+
+
+def main() -> None:
+    given = tyro.cli(_Arguments)
+    ensure_variant()
+    kept, refused = [], []
+    started = time.process_time()
+    for source in garment_sources(given.garments, given.seed):
+        try:
+            kept.append(converted(source, given.side, most=1.0))
+        except UserError as error:
+            refused.append(f"{source.name}: {error}")
+    seconds = (time.process_time() - started) / given.garments
+    print(f"{len(kept)} of {given.garments} converted, {seconds:.2f} core seconds each; refused: {refused}")
+    meshes = [normalised(row.source.mesh()[0], given.side)[0] for row in kept]
+
+    print("| encoding | numbers | chamfer, mean (%) | worst (%) | loops right (%) | decoding (s) |")
+    print("|---|---|---|---|---|---|")
+    for name, encoding in ENCODINGS.items():
+        codes = [encoding.encode(row.fields) for row in kept]
+        numbers = np.mean([sum(array.size for array in code.values()) for code in codes])
+        _row(name, numbers, meshes, lambda i, e=encoding, c=codes: e.decode(c[i], given.side))
+    codes = [BlockEncoding().encode(row.fields) for row in kept]
+    values = np.concatenate([code["values"] for code in codes])
+    for components in given.components:
+        basis = Principal.of(values, components)
+        numbers = np.mean([components * len(code["blocks"]) for code in codes])
+
+        def decoded(i: int, basis: Principal = basis) -> TruncatedFields:
+            tokens = basis.encode(codes[i]["values"])
+            return from_blocks(codes[i]["blocks"], np.clip(basis.decode(tokens), -1, 1), given.side)
+
+        _row(f"blocks, {components} components", numbers, meshes, decoded)
+
+
+def _row(name: str, numbers: float, meshes: list, decoded) -> None:
+    chamfer, right, seconds = [], [], 0.0
+    for index, mesh in enumerate(meshes):
+        begun = time.process_time()
+        fields = decoded(index)
+        seconds += time.process_time() - begun
+        again = fields.surface(largest=True)
+        chamfer.append(round_trip(again, mesh))
+        true, found = (topology(np.asarray(m.vertices), np.asarray(m.faces)) for m in (mesh, again))
+        right.append((true.boundary_loops, true.components) == (found.boundary_loops, found.components))
+    print(f"| {name} | {numbers:.0f} | {np.mean(chamfer):.4f} | {np.max(chamfer):.4f} | "
+          f"{100 * np.mean(right):.1f} | {seconds / len(meshes):.3f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
