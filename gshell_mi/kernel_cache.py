@@ -15,10 +15,11 @@ def kernel_cache_problem() -> str | None:
     if sys.platform == "win32":
         return None    # its place there is made by the system
     told, home = os.environ.get("DRJIT_CACHE_DIR"), os.environ.get("HOME")
-    if not told and not home:
+    named = told or (f"{home}/.drjit" if home else None)
+    if not named:
         where = "HOME is not set"
     else:
-        folder = Path(told) if told else Path(home) / ".drjit"
+        folder = Path(named)
         there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
         if there.is_dir() and os.access(there, os.W_OK | os.X_OK):
             return None

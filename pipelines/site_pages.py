@@ -44,9 +44,12 @@ LIBRARY = {
     "evaluation": ("Evaluation", "How good a result is.", ["evaluation", "compare"]),
     "export": ("Export", "What a fit leaves behind, and what can be made of it.",
                ["export", "turntable", "report", "viewer"]),
+    "generation": ("Generation", "Data sets of surfaces, models of them, and new surfaces.",
+                   ["generation", "dataset", "train", "generate"]),
+    "batch": ("Many jobs", "Fits by the thousand.", ["batch"]),
     "commands": ("Commands and machine", "What the commands share, and what the machine can do.",
-                 ["command_line", "streams", "interrupt", "errors", "files", "own_folder", "memory",
-                  "kernel_cache", "timing", "wording", "progress", "doctor"]),
+                 ["command_line", "streams", "interrupt", "lifetime", "errors", "files", "own_folder",
+                  "memory", "kernel_cache", "timing", "wording", "progress", "doctor"]),
 }
 
 #: Packages of which only the modules right inside are described: what lies deeper may change.

@@ -35,7 +35,7 @@ def white_of(frames: Sequence[Frame]) -> float:
 
 def ignored_white_of(frames: Sequence[Frame]) -> float:
     """The same for what ignore masks cover."""
-    return _common_white(lambda frame: mask_values(frame.ignored),
+    return _common_white(lambda frame: mask_values(frame.ignored) if frame.ignored is not None else None,
                          [frame for frame in frames if frame.ignored is not None])
 
 
@@ -46,7 +46,7 @@ def _common_white(read: Callable[[Frame], np.ndarray | None], frames: Sequence[F
     found = []
     for values in (read(frames[index]) for index in chosen):
         top = 1.0 if values is None else float(values.max(initial=0))
-        if not top < FULL:
+        if values is None or not top < FULL:
             return 1.0
         if top <= 0:
             continue

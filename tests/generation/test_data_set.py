@@ -84,11 +84,11 @@ def test_a_run_that_was_cut_off_goes_on_and_makes_the_same(meshes, made, tmp_pat
     make(meshes, whole)
     calls = []
 
-    def cut_off(*arguments):
+    def cut_off(*arguments, **options):
         calls.append(arguments)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return convert(*arguments)
+        return convert(*arguments, **options)
 
     convert = making._convert_shard
     monkeypatch.setattr(making, "_convert_shard", cut_off)

@@ -73,13 +73,13 @@ def read(source: Path, images: Path | None = None) -> Capture:
     return Capture("IDR / NeuS", source, tuple(frames), region=region)
 
 
-def _camera(matrix: np.ndarray, intrinsic: np.ndarray | None, image: Path, owner: str) -> Camera:
+def _camera(matrix: np.ndarray, given: np.ndarray | None, image: Path, owner: str) -> Camera:
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise UserError(f"The world_mat of {owner} is no finite 4 x 4 matrix; export the cameras again.")
     size = image_size(image)
     projection = matrix[:3]
     if np.allclose(projection[:, :3] @ projection[:, :3].T, np.eye(3), atol=1e-3):
-        projection = _to_pixels(intrinsic, size, owner) @ projection
+        projection = _to_pixels(given, size, owner) @ projection
     # A projection means the same with the opposite sign; depth is to grow forwards.
     projection = projection * np.sign(np.linalg.det(projection[:, :3]) or 1.0)
     intrinsic, rotation = rq(projection[:, :3])

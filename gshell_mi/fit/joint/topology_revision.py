@@ -31,6 +31,7 @@ from ...topology import boundary_edges, equal_patches, mesh_components, mesh_edg
 from ...triangles import positive_part, vertex_areas
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
+from ..judge import Judge
 from .joint import JointStage
 from .residuals import Residuals, near_openings, residuals_of
 
@@ -76,13 +77,14 @@ class TopologyRevision:
     Args:
         joint: does the steps; its fields are explicit.
         views, pixels: the targets.
+        judge: of the fit. What it refuses does not grow: gloss is seen through holes as if it were behind.
         state: what ``state`` gave where the stage goes on, or at the end of that on a coarser lattice, whose
             openings are looked after then.
     """
 
-    def __init__(self, joint: JointStage, views: PinholeViews, pixels: PixelPool,
+    def __init__(self, joint: JointStage, views: PinholeViews, pixels: PixelPool, fit_judge: Judge,
                  state: Mapping[str, np.ndarray]):
-        self.joint, self._views, self._pixels = joint, views, pixels
+        self.joint, self._views, self._pixels, self._fit_judge = joint, views, pixels, fit_judge
         count = joint.iterations
         #: The steps before which openings change and are judged.
         self._changes = round(joint.stage.revision * count)
@@ -169,6 +171,7 @@ class TopologyRevision:
         shut = doubtful(values, vertices, faces, found)
         grows = near_openings(np.where(shut, self._scale, values), vertices, faces, found, smooth,
                               self._reach) & ~before
+        grows &= ~self._refused(vertices, faces, values, grows)
         if not (grows | shut).any():
             return
         changed, near = reopened(values, (before | grows) & ~shut, smooth, self._scale)
@@ -187,6 +190,17 @@ class TopologyRevision:
                        "errors": _errors(found, patch, ~before),
                        "loops": np.array(loops), "spent": np.array(spent),
                        "cell": np.float64(self.joint.subject.cell_size)}
+
+    def _refused(self, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray,
+                 grows: np.ndarray) -> np.ndarray:
+        """(V,) which patches of what would open explain unseen views worse for certain."""
+        if not grows.any():
+            return grows
+        place = np.where(grows, np.unique(equal_patches(grows, faces), return_inverse=True)[1], -1)
+        without, opened = (self._fit_judge.shown(positive_part(vertices, faces, logits)) for logits in (
+            values, np.where(grows, -self._scale, values)))
+        refused = self._fit_judge.compare(without, opened, ((vertices, faces), place)).refused
+        return np.append(refused, False)[np.minimum(place, len(refused))] & grows
 
     def _judge(self, iteration: int) -> None:
         template, vertices, _, values = self._template()

@@ -129,7 +129,7 @@ class Joint:
                     advance()
                 joint.geometry.begin()
         revised = _under(steps.kept, _REVISION) or surface.revision
-        revision = TopologyRevision(joint, fit.views, fit.pixels, revised)
+        revision = TopologyRevision(joint, fit.views, fit.pixels, fit.judge, revised)
         steps.run(revision, self.iterations, joint.optimizers, lambda: (
             _prefixed(_REVISION, revision.state()) | _prefixed(_BLOCKS, block_arrays(subject.fields()))
             | joint.detail_arrays()))

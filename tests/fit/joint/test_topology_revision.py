@@ -14,6 +14,7 @@ from gshell_mi.fit import FitConfig
 from gshell_mi.fit.joint import topology_revision
 from gshell_mi.fit.joint.residuals import Residuals
 from gshell_mi.fit.joint.topology_revision import TopologyRevision, doubtful
+from gshell_mi.fit.judge import Verdict
 from gshell_mi.lattice import TetLattice
 from gshell_mi.template.msdf import without_specks
 from gshell_mi.topology import topology
@@ -118,8 +119,23 @@ def evidence_above(monkeypatch):
 CONFIG = FitConfig(iterations=8).changed({"joint.revision": 0.0, "joint.revision_gain": 0.9})
 
 
-def run(joint: StillJoint, steps: range, state: dict | None = None) -> TopologyRevision:
-    worker = TopologyRevision(joint, None, None, state or {})
+class Says:
+    """A judge that finds everything as good as before, or worse."""
+
+    def __init__(self, gain: float):
+        self.gain = gain
+
+    def shown(self, mesh):
+        return mesh
+
+    def compare(self, before, after, places) -> Verdict:
+        assert len(after[1]) < len(before[1]), "something has opened"
+        one = np.ones(places[1].max() + 1)
+        return Verdict(one, one, self.gain * one, 0.1 * one)
+
+
+def run(joint: StillJoint, steps: range, state: dict | None = None, gain: float = 0.0) -> TopologyRevision:
+    worker = TopologyRevision(joint, None, None, Says(gain), state or {})
     for iteration in steps:
         worker.step(iteration)
     return worker
@@ -136,6 +152,12 @@ def test_growth_stays_if_the_images_are_explained_better(evidence_above, later, 
     assert worker.finish() is (height < 0.4)
     assert joint.height() == pytest.approx(height, abs=1.5 * LATTICE.spacing)
     assert joint.loops() == 1
+
+
+def test_what_unseen_views_refuse_does_not_grow(evidence_above):
+    joint = StillJoint(CONFIG)
+    run(joint, range(1), gain=-1.0)
+    assert joint.height() == pytest.approx(0.45, abs=1.5 * LATTICE.spacing)
 
 
 def test_what_has_grown_rests_until_it_is_judged(evidence_above):
