@@ -141,7 +141,8 @@ class JointStage:
             total = color + self.config.losses.mask * mask + regularisation
             compute(total)
         with phase("backward") as compute:
-            dr.backward(total)
+            if dr.grad_enabled(total):    # there are weights
+                dr.backward(total)
             sought = (self.fields, self.material_optimizer, self.light_optimizer, self.detail_optimizer)
             compute(*(dr.grad(value) for values in sought for value in values.values()))
         progress = iteration / max(self.iterations, 1)

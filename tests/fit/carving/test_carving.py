@@ -104,6 +104,4 @@ def test_a_hollow_may_not_eat_into_a_silhouette(trained, monkeypatch):
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     outside_of_ball = (np.sqrt(x**2 + y**2 + z**2) - HALF) / CELL
     monkeypatch.setattr(carving, "hollows", lambda *_: outside_of_ball)
-    # The patterns alone, where there still is something, are off by a factor of six.
-    monkeypatch.setattr(carving, "_GAIN", 10.0)
     assert trained(solid_block)[2] is None

@@ -161,6 +161,6 @@ def test_light_terms_reach_the_light_only(fit):
 
 def test_a_given_light_has_no_terms(fit):
     joint = stage(fit)
-    config = replace(NONE, light_smoothness=1.0, light_grey=1.0)
+    config = NONE.changed({"losses.extra": {"light_smoothness": 1.0}, "losses.light_grey": 1.0})
     _, terms = JointStage(fit, joint.material, None, config)._regularisers(0)
     assert terms == {}
