@@ -66,7 +66,7 @@ class Fit:
 
     @cached_property
     def held_out_judge(self) -> Judge:
-        """Decides on what was fitted to the ``training`` pixels."""
+        """Tells what the views say that the ``training`` pixels are not of."""
         return self._judge([self._held_out])
 
     def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]]) -> Judge:

@@ -89,13 +89,14 @@ class Refinement:
         if after is None:
             return surface
         with steps.task("verdict"):
-            meshes = (positive_part(at, template.faces, template.logits)
-                      for at in (start, after.positions))
-            verdict = fit.held_out_judge.decide(*meshes)
-        steps.fact(f"{self.name}_verdict", verdict.facts())
+            meshes = [positive_part(at, template.faces, template.logits) for at in (start, after.positions)]
+            verdict, unseen = (judge.decide(*meshes) for judge in (fit.judge, fit.held_out_judge))
+        steps.fact(f"{self.name}_verdict", verdict.facts() | {"unseen_gain": round(float(unseen.gain[0]), 5)})
+        # All views tell whether it is more than noise; those it was not fitted to, that it is no gloss.
+        accepted = verdict.accepted[0] and unseen.gain[0] > 0
         if self.first:
-            return replace(surface, moved=(after,)) if verdict.accepted[0] else surface
-        moved = (after, *surface.moved) if verdict.accepted[0] else (*surface.moved, after)
+            return replace(surface, moved=(after,)) if accepted else surface
+        moved = (after, *surface.moved) if accepted else (*surface.moved, after)
         return replace(surface, moved=moved)
 
     def _moved(self, appearance: SurfaceRadiance, template: Template, positions: np.ndarray, fit: Fit,
