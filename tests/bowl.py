@@ -11,7 +11,7 @@ VIEWS = 12
 SIZE = 48
 
 #: Options of the command that make the fit short. Those of the openings suit so small a scene and few steps.
-SHORT = ("--openings.iterations", "100", "--radiance.batch", "4096", "--radiance.smoothing", "8",
+SHORT = ("--openings.iterations", "100", "--radiance.batch", "16384", "--radiance.smoothing", "8",
          "--openings.mask", "0.01", "--openings.binary", "0.015", "--openings.closing", "0.003",
          "--cavities.iterations", "10", "--cavities.batch", "4096", "--volume.iterations", "0",
          "--refinement.iterations", "8", "--folds.iterations", "0", "--iterations", "12",
@@ -19,7 +19,7 @@ SHORT = ("--openings.iterations", "100", "--radiance.batch", "4096", "--radiance
          "--model.light-height", "8", "--no-report")
 
 #: Added to these where openings do not matter: hardly any steps, and the template stays closed.
-CLOSED = ("--openings.iterations", "5",
+CLOSED = ("--openings.iterations", "5", "--openings.rounds", "0",
           "--cavities.iterations", "4", "--refinement.iterations", "2")
 
 

@@ -15,9 +15,14 @@ def decisions(monkeypatch):
     from gshell_mi.fit.judge import Judge, Verdict
 
     said: list[bool] = []
+    last = False
 
     def decide(self, before, after) -> Verdict:
-        return Verdict(np.ones(1), np.ones(1), np.array([1.0 if said.pop(0) else -1.0]), np.array([0.1]))
+        nonlocal last
+        if len(self.splits) > 1:
+            last = said.pop(0)
+        # Those that the refinement has not seen say the same.
+        return Verdict(np.ones(1), np.ones(1), np.array([1.0 if last else -1.0]), np.array([0.1]))
 
     monkeypatch.setattr(Judge, "decide", decide)
     return lambda *accepted: said.extend(accepted)

@@ -134,7 +134,7 @@ def test_a_checkpoint_in_a_stage_that_there_is_not(tmp_path):
 
 def test_a_surface_is_what_its_arrays_say(tmp_path):
     count = START.lattice.vertex_count
-    moved = [Moved(name, np.ones((5, 3)), np.zeros((5, 3)), 0.5, {"radiance/opacity/value": np.ones(3)})
+    moved = [Moved(name, np.ones((5, 3)), np.zeros((5, 3)), {"radiance/opacity/value": np.ones(3)})
              for name in ("folds", "refinement")]
     seen = Seen(np.ones((count, 3)), np.ones(count, bool), np.float32(2))
     whole = replace(START, hull=np.arange(count), seen=seen, moved=tuple(moved),

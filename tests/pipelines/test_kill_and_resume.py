@@ -71,5 +71,5 @@ def test_kills(bowl_scene, tmp_path):
     assert not list(killed.rglob(".*"))
     steps = [(entry["stage"], entry["iteration"])
              for entry in map(json.loads, (killed / "log.jsonl").read_text().splitlines())]
-    counts = {"appearance": 5, "carving": 4, "refinement": 2, "joint": 12}
+    counts = {"openings": 5, "cavities": 4, "refinement": 2, "joint": 12}
     assert steps == [(stage, i) for stage, count in counts.items() for i in range(count)]

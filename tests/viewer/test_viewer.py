@@ -120,7 +120,7 @@ def test_of_a_whole_fit(bowl_scene, tmp_path, capfd, monkeypatch):
     options = [*SHORT, *CLOSED, "--iterations", "2", "--quiet", "--viewer", "--viewer-port", "0"]
     assert main([str(bowl_scene), "-o", str(tmp_path / "out"), *options]) == 0
     assert "live view: http://localhost:" in capfd.readouterr().err
-    assert set(seen) == {"appearance", "carving", "refinement", "joint"}
+    assert set(seen) == {"openings", "cavities", "refinement", "joint"}
     for found in seen.values():
         assert found.faces.max() < len(found.vertices) == len(found.colors)
         assert np.linalg.norm(found.vertices, axis=1).max() < 1 and len(found.faces) > 100
