@@ -143,7 +143,7 @@ def test_a_surface_is_what_its_arrays_say(tmp_path):
     checkpoint.save(tmp_path / "checkpoint.npz")
     found = Surface.from_arrays(Checkpoint.load(tmp_path / "checkpoint.npz").arrays)
     assert found.lattice == whole.lattice and found.seen.light == 2
-    assert [one.stage for one in found.moved] == ["folds", "refinement"] and found.moved[1].error == 0.5
+    assert [one.stage for one in found.moved] == ["folds", "refinement"]
     assert found.to_arrays().keys() == whole.to_arrays().keys()
     for name, array in found.to_arrays().items():
         np.testing.assert_array_equal(array, whole.to_arrays()[name])
