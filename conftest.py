@@ -1,6 +1,7 @@
 """Every test runs on one Mitsuba variant, chosen with ``--variant`` (default ``llvm_ad_rgb``)."""
 
 import os
+from importlib.util import find_spec
 from pathlib import Path
 
 # BLAS threads and Dr.Jit's thread pool fight for the same cores.
@@ -8,6 +9,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import mitsuba as mi
 import pytest
+
+# Modules that cannot be imported without the extra "generate": their own tests say that they are skipped.
+collect_ignore = [] if find_spec("torch") and find_spec("monai") else [
+    "gshell_mi/generation/models", "gshell_mi/generation/sampling.py", "gshell_mi/generation/training.py"]
 
 
 def pytest_addoption(parser):
@@ -27,6 +32,14 @@ def variant(request) -> str:
 def scenes_dir() -> Path:
     """The scenes folder of this repository."""
     return Path(__file__).parent / "scenes"
+
+
+@pytest.fixture(scope="session")
+def ball():
+    """A unit sphere of 2562 vertices."""
+    import trimesh
+
+    return trimesh.creation.icosphere(4)
 
 
 @pytest.fixture(scope="session")

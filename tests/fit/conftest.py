@@ -1,11 +1,5 @@
 import numpy as np
 import pytest
-import trimesh
-
-
-@pytest.fixture(scope="session")
-def ball() -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(4)
 
 
 @pytest.fixture

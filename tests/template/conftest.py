@@ -1,7 +1,0 @@
-import pytest
-import trimesh
-
-
-@pytest.fixture(scope="session")
-def ball() -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(4)
