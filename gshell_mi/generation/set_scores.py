@@ -83,7 +83,7 @@ def nearest_neighbour_accuracy(among_a: np.ndarray, between: np.ndarray, among_b
         among_b: (m, m).
 
     >>> one = np.ones((3, 3))
-    >>> nearest_neighbour_accuracy(one, one + 1, one), nearest_neighbour_accuracy(one, one, one)
+    >>> nearest_neighbour_accuracy(one, one + 1, one), round(nearest_neighbour_accuracy(one, one, one), 3)
     (1.0, 0.4)
     """
     distance = np.block([[among_a, between], [between.T, among_b]]).astype(float)
