@@ -1,4 +1,4 @@
-"""Distance to what depth maps of posed views leave: everything that no view looks through."""
+"""Distance to what depth maps of posed views leave: what too few of the views look through."""
 
 from __future__ import annotations
 

@@ -99,9 +99,9 @@ class Judge:
     """Decides on every discrete change of the surface, by one rule.
 
     Before and after, each mesh has the mean colour that some views show it in, of one side and of the other,
-    and others judge. Whatever neither can explain so, such as
-    gloss, texture finer than the meshes, poses and noise, is in both errors and cancels in their difference:
-    a change counts if the mean of that over the views is above twice its standard error.
+    and others judge. Whatever neither can explain so, such as gloss, texture finer than the meshes, poses and
+    noise, is in both errors. A change counts if the logarithm of their ratio, in the mean over the views, is
+    above twice its standard error.
 
     Args:
         views, targets: the images. Pixels beside the masks' outlines do not count.
@@ -191,6 +191,17 @@ class Judge:
 
     def _rays(self, sample: PixelSample) -> mi.Ray3f:
         return self.views.rays(sample.view, sample.film)
+
+
+def places_of(chosen: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """(V,) places for ``Judge.compare``: from 0 on for each patch that a chosen vertex is in, else -1.
+
+    >>> places_of(np.array([True, False, True]), np.array([7, 7, 3])).tolist()
+    [1, -1, 0]
+    """
+    place = np.full(len(chosen), -1)
+    place[chosen] = np.unique(patch[chosen], return_inverse=True)[1]
+    return place
 
 
 def _verdict(rays: np.ndarray, before: np.ndarray, after: np.ndarray) -> Verdict:

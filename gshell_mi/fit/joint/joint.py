@@ -124,27 +124,32 @@ class JointStage:
         with phase("scene update"):
             self.apply(geometry=moving)
         views = self._views(iteration)
-        images, color, mask = [], mi.Float(0), mi.Float(0)
+        images, color, mask, sought = [], mi.Float(0), mi.Float(0), mi.Float(0)
         for turn, view in enumerate(views):
             image = self._render(view, self.seed(iteration, turn))
             with phase("losses") as compute:
                 of_color, of_mask = self._image_loss(view, image), self._mask_loss(view, image)
                 of_view = (of_color + self.config.losses.mask * of_mask) / len(views)
                 compute(of_view)
-            # A light that turns with the camera has to be where it was when the image is differentiated.
-            with phase("backward"):
-                dr.backward(of_view, flags=dr.ADFlag.ClearVertices)
+            if self._turns:
+                # The light has to be where it was when the image is differentiated. If it stays, one pass
+                # through the extraction serves all views.
+                with phase("backward"):
+                    dr.backward(of_view, flags=dr.ADFlag.ClearVertices)
+            else:
+                sought += of_view
             color, mask = color + dr.detach(of_color) / len(views), mask + dr.detach(of_mask) / len(views)
             images.append(dr.detach(image))
         with phase("losses") as compute:
             regularisation, terms = self._regularisers(views)
-            total = color + self.config.losses.mask * mask + regularisation
-            compute(total)
+            total = color + self.config.losses.mask * mask + dr.detach(regularisation)
+            sought += regularisation
+            compute(total, sought)
         with phase("backward") as compute:
-            if dr.grad_enabled(total):    # there are weights
-                dr.backward(total)
-            sought = (self.fields, self.material_optimizer, self.light_optimizer, self.detail_optimizer)
-            compute(*(dr.grad(value) for values in sought for value in values.values()))
+            if dr.grad_enabled(sought):
+                dr.backward(sought)
+            parameters = (self.fields, self.material_optimizer, self.light_optimizer, self.detail_optimizer)
+            compute(*(dr.grad(value) for values in parameters for value in values.values()))
         progress = iteration / max(self.iterations, 1)
         with phase("optimiser"):
             diffuse = LatticeDiffusion(self.subject.lattice, cells=self.subject.surface.cells)

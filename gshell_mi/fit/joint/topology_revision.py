@@ -31,7 +31,7 @@ from ...topology import boundary_edges, equal_patches, mesh_components, mesh_edg
 from ...triangles import positive_part, vertex_areas
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
-from ..judge import Judge
+from ..judge import Judge, places_of
 from .joint import JointStage
 from .residuals import Residuals, near_openings, residuals_of
 
@@ -77,7 +77,8 @@ class TopologyRevision:
     Args:
         joint: does the steps; its fields are explicit.
         views, pixels: the targets.
-        judge: of the fit. What it refuses does not grow: gloss is seen through holes as if it were behind.
+        fit_judge: that of all stages. What it refuses does not grow: through holes, gloss is seen as if it
+            were behind.
         state: what ``state`` gave where the stage goes on, or at the end of that on a coarser lattice, whose
             openings are looked after then.
     """
@@ -178,9 +179,7 @@ class TopologyRevision:
         former = self._msdf()
         msdf = self._write(template, changed, near)
         self.joint.geometry.frozen = (msdf < -_CORE * self._scale) & (msdf != former)
-        patch = np.full(len(vertices), -1)
-        place = equal_patches(np.where(grows, 1, np.where(shut, 2, 0)), faces)
-        patch[grows | shut] = np.unique(place[grows | shut], return_inverse=True)[1]
+        patch = places_of(grows | shut, equal_patches(np.where(grows, 1, np.where(shut, 2, 0)), faces))
         # Shutting an opening takes its loops away, growing none; a sheet that comes back brings one.
         solid = ~before
         loops = _loops(vertices, faces, solid)
@@ -196,11 +195,11 @@ class TopologyRevision:
         """(V,) which patches of what would open explain unseen views worse for certain."""
         if not grows.any():
             return grows
-        place = np.where(grows, np.unique(equal_patches(grows, faces), return_inverse=True)[1], -1)
+        place = places_of(grows, equal_patches(grows, faces))
         without, opened = (self._fit_judge.shown(positive_part(vertices, faces, logits)) for logits in (
             values, np.where(grows, -self._scale, values)))
         refused = self._fit_judge.compare(without, opened, ((vertices, faces), place)).refused
-        return np.append(refused, False)[np.minimum(place, len(refused))] & grows
+        return grows & refused[place]
 
     def _judge(self, iteration: int) -> None:
         template, vertices, _, values = self._template()

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...topology import equal_patches, mesh_edges, patch_sizes, spread, vertex_components
 from ...triangles import positive_part
-from ..judge import Judge, Mesh
+from ..judge import Judge, Mesh, Shown, places_of
 
 #: Openings are parted where they are at most twice this many vertices wide.
 _NECK = 2
@@ -15,7 +15,8 @@ _NECK = 2
 _CLOSINGS, _WORST = 5, 0.5
 
 
-def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge) -> np.ndarray:
+def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
+                   closed: Shown | None = None) -> np.ndarray:
     """Closes the openings through which unseen views are not explained better than without them.
 
     A hull that bulges over a fold, or a highlight, makes the views disagree on a vertex's radiance as a
@@ -27,6 +28,7 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge) -> np.ndarr
         logits: (V,) opacity logits; surface where positive.
         template: the mesh that is opened.
         judge: of the fit.
+        closed: the template as the judge shows it, if that is known.
 
     Returns:
         (V,) logits, those of rejected openings negated.
@@ -38,20 +40,19 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge) -> np.ndarr
     if opened.all():
         # Nothing at all explains no image.
         return -logits
-    closed, kept = judge.shown(template), opened
+    kept = opened
+    if closed is None:
+        closed = judge.shown(template)
     for closing in reversed(range(_CLOSINGS)):
-        lobes = _lobes(kept, faces)
-        place = np.where(kept, np.unique(lobes, return_inverse=True)[1], -1)
+        place = places_of(kept, _lobes(kept, faces))
         verdict = judge.compare(closed, _shown(judge, template, ~kept, logits), (template, place))
-        if verdict.accepted[np.unique(place[kept])].all():
-            break
-        # At last there is no time for more.
         worst = ~verdict.accepted
+        # The worst first; all where none is worse but some are not surely better, and in the last round.
         if closing:
             loss = np.where(worst, np.maximum(-verdict.gain, 0), 0)
             worst &= loss >= _WORST * loss.max()
         kept = kept & ~worst[place]
-        if not kept.any():
+        if not worst.any() or not kept.any():
             break
     return np.where(opened & ~kept, -logits, logits)
 
@@ -75,13 +76,13 @@ def open_rejected(logits: np.ndarray, template: Mesh, judge: Judge) -> np.ndarra
     island = solid & (size < largest)
     if not island.any():
         return logits
-    place = np.where(island, np.unique(patch, return_inverse=True)[1], -1)
+    place = places_of(island, patch)
     without, present = (_shown(judge, template, chosen, logits) for chosen in (solid & ~island, solid))
-    accepted = np.append(judge.compare(without, present, (template, place)).accepted, False)
-    return np.where(island & ~accepted[np.minimum(place, len(accepted) - 1)], -logits, logits)
+    accepted = judge.compare(without, present, (template, place)).accepted
+    return np.where(island & ~accepted[place], -logits, logits)
 
 
-def _shown(judge: Judge, template: Mesh, solid: np.ndarray, logits: np.ndarray):
+def _shown(judge: Judge, template: Mesh, solid: np.ndarray, logits: np.ndarray) -> Shown:
     """The part of a template that is solid, its rims where the logits have them."""
     vertices, faces = template
     return judge.shown(positive_part(vertices, faces, np.where(solid, np.abs(logits), -np.abs(logits))))

@@ -154,6 +154,7 @@ def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, rou
         (V,) opacity logits, negative at openings.
     """
     opened, unjustified = (np.zeros(len(template[0]), bool) for _ in range(2))
+    closed = judge.shown(template)
     for trained_again in range(rounds + 1):
         if trained_again:
             appearance.begin_again(unjustified, opened)
@@ -166,9 +167,8 @@ def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, rou
             candidate = clean(np.minimum(logits, smoothed - level))
             if not ((candidate <= 0) & (logits > 0)).any():
                 continue
-            found = candidate
-            for without_rejected in (close_rejected, open_rejected):
-                found = clean(without_rejected(found, template, judge))
+            found = clean(close_rejected(candidate, template, judge, closed))
+            found = clean(open_rejected(found, template, judge))
             logits = np.minimum(logits, found)
             if ((found <= 0) == (candidate <= 0)).all():
                 break
