@@ -10,20 +10,17 @@ import mitsuba as mi
 import numpy as np
 
 from ..compat import mesh_scene
-from ..fields.smoothing import MeshDiffusion
-from ..pixels import COVERED, PixelPool, PixelSample
+from ..pixels import PixelPool, PixelSample
 from ..targets import Target
 from ..views import PinholeViews
 from .radiance.contrast import Contrast
+from .radiance.shown import Mesh, Shown
 
 #: Pixels this near to a mask's outline do not judge: where a surface ends to a cell is found later.
 _OUTLINE = 3
 
-#: Batches of rays that tell the colours, and that judge.
-_LEARNT, _JUDGED = 40, 20
-
-#: Lambda that spreads colours along a mesh to vertices that hardly a ray comes near.
-_SMOOTHING = 0.5
+#: Batches of rays that judge.
+_JUDGED = 20
 
 #: Standard errors by which a change has to be better.
 _SURE = 2.0
@@ -33,9 +30,6 @@ _EXACT = 1e-3
 
 #: Views that have to tell of a place before their spread does.
 _VIEWS = 4
-
-#: Vertices (V, 3) and faces (F, 3).
-Mesh = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -71,37 +65,13 @@ class Verdict:
                 "noise": [round(float(value), 5) if np.isfinite(value) else -1.0 for value in self.noise]}
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A mesh in the mean colours that images show it in.
-
-    Attributes:
-        scene: of the mesh alone.
-        corners: (3 F,) vertex indices.
-        colors: for each split of the views, (2 V * 3) of both sides of the vertices.
-    """
-
-    scene: mi.Scene
-    corners: mi.UInt32
-    colors: list[mi.Float]
-
-    def look(self, ray: mi.Ray3f, split: int) -> tuple[mi.Color3f, mi.Float]:
-        """Radiance and coverage along rays."""
-        radiance, alpha = mi.Color3f(0), mi.Float(0)
-        for index, weight, hit in _sides(self.scene, self.corners, ray):
-            radiance += weight * dr.gather(mi.Color3f, self.colors[split], index, hit)
-            alpha = dr.select(hit, 1, alpha)
-        dr.eval(radiance, alpha)
-        return radiance, alpha
-
-
 class Judge:
     """Decides on every discrete change of the surface, by one rule.
 
     Before and after, each mesh has the mean colour that some views show it in, of one side and of the other,
-    and others judge. Whatever neither can explain so, such as gloss, texture finer than the meshes, poses and
-    noise, is in both errors. A change counts if the logarithm of their ratio, in the mean over the views, is
-    above twice its standard error.
+    times what all of it mirrors, and others judge. What neither can explain so, such as texture finer than
+    the meshes, poses and noise, is in both errors. A change counts if the logarithm of their ratio, in the
+    mean over the views, is above twice its standard error.
 
     Args:
         views, targets: the images. Pixels beside the masks' outlines do not count.
@@ -128,22 +98,8 @@ class Judge:
                  PixelPool(self.views, self.targets, unknown, _OUTLINE)) for known, unknown in self.splits]
 
     def shown(self, mesh: Mesh) -> Shown:
-        """A mesh in the colours of the images."""
-        vertices, faces = mesh
-        scene, corners = mesh_scene(vertices, faces), mi.UInt32(faces.astype(np.uint32).ravel())
-        colors = []
-        with dr.suspend_grad():
-            for known, _ in self._pools:
-                sums = [dr.zeros(mi.Float, 2 * len(vertices)) for _ in range(4)]
-                for step in range(_LEARNT):
-                    sample = known.sample(self.batch, seed=self.seed, step=step)
-                    whole = sample.alpha > COVERED
-                    for index, weight, hit in _sides(scene, corners, self._rays(sample)):
-                        for total, value in zip(sums, (*sample.radiance, mi.Float(1)), strict=True):
-                            dr.scatter_reduce(dr.ReduceOp.Add, total, weight * value, index, hit & whole)
-                    dr.eval(sums)
-                colors.append(_means(sums, faces, len(vertices)))
-        return Shown(scene, corners, colors)
+        """A mesh as the images show it, once for each of the splits."""
+        return Shown(mesh, self.views, [known for known, _ in self._pools], batch=self.batch, seed=self.seed)
 
     def compare(self, before: Shown, after: Shown, places: tuple[Mesh, np.ndarray] | None = None) -> Verdict:
         """Judges a change.
@@ -219,29 +175,3 @@ def _verdict(rays: np.ndarray, before: np.ndarray, after: np.ndarray) -> Verdict
     noise[seen < _VIEWS] = np.inf
     per_ray = np.maximum(total, 1)
     return Verdict(before.sum(axis=1) / per_ray, after.sum(axis=1) / per_ray, gain, noise)
-
-
-def _sides(scene: mi.Scene, corners: mi.UInt32, ray: mi.Ray3f) -> list[tuple[mi.UInt32, mi.Float, mi.Bool]]:
-    """What rays meet first: the three vertices, even numbers from the front and odd ones from the back, their
-    weights, and whether anything is met."""
-    found = scene.ray_intersect_preliminary(ray, coherent=False)
-    dr.eval(found)
-    hit = found.is_valid()
-    back = dr.dot(found.compute_surface_interaction(ray, mi.RayFlags.Minimal, hit).n, ray.d) > 0
-    uv = dr.select(hit, found.prim_uv, 0)
-    weights = (1 - uv.x - uv.y, uv.x, uv.y)
-    vertices = (dr.gather(mi.UInt32, corners, 3 * found.prim_index + corner, hit) for corner in range(3))
-    return [(2 * vertex + dr.select(back, mi.UInt32(1), 0), weight, hit)
-            for vertex, weight in zip(vertices, weights, strict=True)]
-
-
-def _means(sums: list[mi.Float], faces: np.ndarray, count: int) -> mi.Float:
-    """(2 V * 3) mean colour of each vertex' sides, from weighted sums and the weights."""
-    smooth = MeshDiffusion(faces, count, _SMOOTHING)
-    side = 2 * dr.arange(mi.UInt32, count)
-    means = dr.zeros(mi.Float, 6 * count)
-    for back in range(2):
-        *colors, weight = (dr.maximum(smooth(dr.gather(mi.Float, total, side + back)), 0) for total in sums)
-        dr.scatter(means, mi.Color3f(*colors) / dr.maximum(weight, 1e-6), side + back)
-    dr.eval(means)
-    return means

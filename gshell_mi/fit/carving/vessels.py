@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from ...template.msdf import msdf_from_template, splat_to_lattice
 from ...topology import equal_patches
-from ..judge import Shown
+from ..radiance.shown import Shown
 from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import Template, template_of

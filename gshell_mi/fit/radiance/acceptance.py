@@ -2,33 +2,40 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 
+from ...fields.smoothing import MeshDiffusion
 from ...topology import equal_patches, mesh_edges, patch_sizes, spread, vertex_components
 from ...triangles import positive_part
-from ..judge import Judge, Mesh, Shown, places_of
+from ..judge import Judge, places_of
+from .shown import Mesh, Shown
 
 #: Openings are parted where they are at most twice this many vertices wide.
 _NECK = 2
 
 #: Rounds in which openings are closed, each time those that are this near to the worst; in the last one all.
-_CLOSINGS, _WORST = 5, 0.5
+_CLOSINGS, _WORST = 7, 0.5
+
+#: Lambda that smooths what single vertices tell along the mesh: a vertex is met by some hundred rays.
+_SMOOTHING = 10.0
 
 
 def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
-                   closed: Shown | None = None) -> np.ndarray:
+                   closed: Shown) -> np.ndarray:
     """Closes the openings through which unseen views are not explained better than without them.
 
     A hull that bulges over a fold, or a highlight, makes the views disagree on a vertex's radiance as a
     cap does, and may open there. But the sheet behind such a hole is farther from the truth than the hull,
     so the images disagree more. What hangs together by a narrow neck only is judged in parts. Through one
-    opening others are seen, so the worst are closed first.
+    opening others are seen, so the worst are closed first. Where a part is rejected, it is first closed
+    where its own vertices speak against it, and judged again: an opening may run on into gloss beside it.
 
     Args:
         logits: (V,) opacity logits; surface where positive.
         template: the mesh that is opened.
         judge: of the fit.
-        closed: the template as the judge shows it, if that is known.
+        closed: the template as the judge shows it.
 
     Returns:
         (V,) logits, those of rejected openings negated.
@@ -40,19 +47,27 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
     if opened.all():
         # Nothing at all explains no image.
         return -logits
-    kept = opened
-    if closed is None:
-        closed = judge.shown(template)
+    kept, trimmed = opened, np.zeros_like(opened)
     for closing in reversed(range(_CLOSINGS)):
         place = places_of(kept, _lobes(kept, faces))
-        verdict = judge.compare(closed, _shown(judge, template, ~kept, logits), (template, place))
+        shown = _shown(judge, template, ~kept, logits)
+        verdict = judge.compare(closed, shown, (template, place))
         worst = ~verdict.accepted
         # The worst first; all where none is worse but some are not surely better, and in the last round.
         if closing:
             loss = np.where(worst, np.maximum(-verdict.gain, 0), 0)
             worst &= loss >= _WORST * loss.max()
-        kept = kept & ~worst[place]
-        if not worst.any() or not kept.any():
+        rejected = kept & worst[place]
+        if not rejected.any():
+            break
+        anew = rejected & ~trimmed
+        if closing and anew.any():
+            anew &= _gains(judge, template, closed, shown, anew) > 0
+        else:
+            anew[:] = False
+        kept = kept & (~rejected | anew)
+        trimmed |= rejected
+        if not kept.any():
             break
     return np.where(opened & ~kept, -logits, logits)
 
@@ -80,6 +95,15 @@ def open_rejected(logits: np.ndarray, template: Mesh, judge: Judge) -> np.ndarra
     without, present = (_shown(judge, template, chosen, logits) for chosen in (solid & ~island, solid))
     accepted = judge.compare(without, present, (template, place)).accepted
     return np.where(island & ~accepted[place], -logits, logits)
+
+
+def _gains(judge: Judge, template: Mesh, before: Shown, after: Shown, chosen: np.ndarray) -> np.ndarray:
+    """(V,) what each ``chosen`` vertex tells of a change, smoothed along the template; up to a factor."""
+    count = len(chosen)
+    place = places_of(chosen, np.arange(count))
+    gain = np.where(chosen, judge.compare(before, after, (template, place)).gain[place], 0)
+    smooth = MeshDiffusion(template[1], count, _SMOOTHING)
+    return smooth(mi.Float(gain.astype(np.float32))).numpy()
 
 
 def _shown(judge: Judge, template: Mesh, solid: np.ndarray, logits: np.ndarray) -> Shown:

@@ -1,11 +1,10 @@
 """A radiance on a surface: which parts of a template are surface, found without a light model.
 
-Every vertex of the watertight template carries an opacity and one radiance per side; a glossy lobe that all
-share adds what depends on the view. A pixel's ray
-composites the first few sheets that it meets front to back. Where the object is open (the neck of a
-T-shirt, the rim of a hat) no single radiance of the template's cap agrees with what the views see
-through it, so the cap fades and the inner side behind it takes over. As there is neither a light nor a
-material, nothing can be traded for scale or shading, and a path tracer's noise is absent.
+Every vertex of the watertight template carries an opacity and one radiance per side, times what all of the
+surface mirrors. A pixel's ray composites the first few sheets that it meets front to back. Where the object
+is open (the neck of a T-shirt, the rim of a hat) no single radiance of the template's cap agrees with what
+the views see through it, so the cap fades and the inner side behind it takes over. As there is neither a
+light nor a material, nothing can be traded for scale or shading, and a path tracer's noise is absent.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ from ..bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from .contrast import Contrast
-from .gloss import PER_SIDE, SHARED, initial_lobe, mirrored_radiance
 from .layers import Sheet, trace_layers
+from .mirrored import Mirrored, mirrored_direction
 
 #: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
 #: enough that all are seen; colours fitted at full opacity would bleed what is inside into the caps.
@@ -53,9 +52,6 @@ _ROUNDS_FROM_GREY = 3
 
 #: Random pixels of these steps must not depend on how many training steps came before.
 _EXTRA_STEP = 1 << 20
-
-#: The lobe learns slower than the radiance by this factor: it is to explain what that cannot.
-_LOBE_RATE = 0.4
 
 
 @dataclass(frozen=True)
@@ -82,13 +78,12 @@ class SurfaceRadiance:
         pixels: the targets' pixels.
         config: how it is fitted.
         seed: of the random pixels.
-        glossy: adds the lobe, for shapes. Openings are told apart better without: it explains a little of
-            everything, hence also of what is seen through a cap.
+        mirrored: known factor of the radiance; without one it does not depend on the direction.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: PinholeViews, pixels: PixelPool,
-                 config: RadianceConfig, *, seed: int = 0, glossy: bool = False):
-        self.views, self.pixels, self.config, self.glossy = views, pixels, config, glossy
+                 config: RadianceConfig, *, seed: int = 0, mirrored: Mirrored | None = None):
+        self.views, self.pixels, self.config, self._mirrored = views, pixels, config, mirrored
         self.seed = seed
         self.vertex_count = len(vertices)
         self._positions = mi.Float(vertices.ravel().astype(np.float32))
@@ -101,9 +96,7 @@ class SurfaceRadiance:
         self.optimizer = mi.ad.Adam(lr=config.lr)
         #: (V, 2, 3): of the front and the back of every vertex.
         self.optimizer["radiance"] = dr.full(mi.Float, grey, 6 * self.vertex_count)
-        if glossy:
-            for name, values in initial_lobe(self.vertex_count, pixels.mean_radiance()).items():
-                self.optimizer[name] = values
+        if mirrored:
             self._normals = self._smooth_normals()
         self._set_opacity(np.full(self.vertex_count, _INITIAL_LOGIT))
         self._opacity_rests = False
@@ -135,7 +128,7 @@ class SurfaceRadiance:
     def move(self, positions: mi.Float) -> None:
         """Puts the vertices elsewhere: (3 V,) world positions, x0, y0, z0, x1, ..."""
         self._positions = positions
-        if self.glossy:
+        if self._mirrored:
             self._normals = self._smooth_normals()
         move_mesh(self.scene, positions)
 
@@ -179,16 +172,13 @@ class SurfaceRadiance:
         return self.composite(self._sheets(ray), dr.width(ray.d))
 
     def update(self, names: tuple[str, ...], rate: float) -> None:
-        """Steps the parameters ``names`` and the lobe; the others rest.
+        """Steps the parameters ``names``; the others rest.
 
         Values of the vertices move along their Sobolev gradients.
         """
         rates = dict.fromkeys(("opacity", "radiance"), 0.0) | dict.fromkeys(names, rate)
-        if self.glossy:
-            rates |= dict.fromkeys((PER_SIDE, *SHARED), _LOBE_RATE * rate)
         gradients = {name: dr.grad(self.optimizer[name]) for name, value in rates.items() if value}
-        gradients |= self._smooth.together({name: gradient for name, gradient in gradients.items()
-                                            if name not in SHARED})
+        gradients = self._smooth.together(gradients)
         for name in rates:
             parameter = self.optimizer[name]
             dr.set_grad(parameter, gradients.get(name, dr.zeros(mi.Float, dr.width(parameter))))
@@ -259,24 +249,21 @@ class SurfaceRadiance:
             for weight, corner in zip(sheet.weights, sheet.face, strict=True):
                 color += weight * dr.gather(mi.Color3f, self.optimizer["radiance"], sheet.side(corner))
             color = softplus(color)
-            if self.glossy:
-                color += self._mirrored(sheet)
+            if self._mirrored:
+                mirrored = mirrored_direction(dr.normalize(sheet.direction), self._normal(sheet))
+                color *= self._mirrored.factor(mirrored)
             alpha = sigmoid(sheet.interpolate(opacity))
             radiance = _spread(dr.lerp(radiance, color, alpha), sheet.lane, 0, width)
             transmittance = _spread((1 - alpha) * transmittance, sheet.lane, 1, width)
         return radiance, 1 - transmittance
 
-    def _mirrored(self, sheet: Sheet) -> mi.Color3f:
-        """What the lobe adds to the radiance of a sheet."""
-        gloss, normal = mi.Float(0), mi.Vector3f(0)
+    def _normal(self, sheet: Sheet) -> mi.Vector3f:
+        """Smooth normals at hits, of any length."""
+        normal = mi.Vector3f(0)
         for weight, corner in zip(sheet.weights, sheet.face, strict=True):
-            gloss += weight * dr.gather(mi.Float, self.optimizer[PER_SIDE], sheet.side(corner))
-            # The lobe is to explain highlights, not to turn the surface.
+            # What depends on the view is to explain highlights, not to turn the surface.
             normal += dr.detach(weight) * dr.gather(mi.Vector3f, self._normals, corner)
-        length = dr.norm(normal)
-        normal = dr.select(length > 1e-3, normal / length, -sheet.direction)
-        return mirrored_radiance(self.optimizer, gloss, dr.select(sheet.front, normal, -normal),
-                                 sheet.direction)
+        return normal
 
     def _smooth_normals(self) -> mi.Float:
         """(3 V,) unit normals, as smooth as the other values at the vertices."""

@@ -26,8 +26,9 @@ from ...schedules import decay_at
 from ...template.msdf import clean_opacity, msdf_from_template, splat_to_lattice
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
-from ..judge import Judge, Mesh
+from ..judge import Judge
 from ..radiance.acceptance import close_rejected, open_rejected
+from ..radiance.shown import Mesh, Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
 from ..stage import Fit
@@ -74,18 +75,19 @@ class Openings:
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface with openings, and what was seen of it."""
-        closed = surface.with_fields(msdf=np.ones_like(surface.fields.sdf))
-        template = template_of(fit.scene.subject, closed)
+        whole = surface.with_fields(msdf=np.ones_like(surface.fields.sdf))
+        template = template_of(fit.scene.subject, whole)
         vertices, faces, count = template.vertices, template.faces, self.config.iterations
+        closed = fit.judge.shown(template.closed)
         appearance = SurfaceRadiance(template.start, faces, fit.views, fit.pixels, fit.config.radiance,
-                                     seed=fit.config.seed)
+                                     seed=fit.config.seed, mirrored=closed.mirrored)
         training = OpacityTraining(appearance, self.config)
         if not fit.config.watertight:
             steps.run(training, count, {"radiance": appearance.optimizer})
         with steps.task("verdict"):
             logits = np.ones(len(vertices))
             if not fit.config.watertight:
-                logits = find_openings(appearance, template.closed, fit.judge, self.config.rounds,
+                logits = find_openings(appearance, template.closed, fit.judge, closed, self.config.rounds,
                                        partial(clean_opacity, vertices=vertices, faces=faces,
                                                min_area=fit.config.min_area),
                                        lambda again: steps.repeat(training, count, again * count))
@@ -138,7 +140,7 @@ class OpacityTraining:
         return self.appearance.preview()
 
 
-def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, rounds: int,
+def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, closed: Shown, rounds: int,
                   clean: Callable[[np.ndarray], np.ndarray], train: Callable[[int], None]) -> np.ndarray:
     """Where the images justify an opening.
 
@@ -146,6 +148,7 @@ def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, rou
         appearance: after its training; it is trained further.
         template: the mesh that it is on.
         judge: of the fit.
+        closed: the template as the judge shows it.
         rounds: in which it is trained again, at most.
         clean: undoes cuts and islands of (V,) logits that are too small, as ``clean_opacity`` does.
         train: does all steps of its training; told for which time, after the first, from 1.
@@ -154,7 +157,6 @@ def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, rou
         (V,) opacity logits, negative at openings.
     """
     opened, unjustified = (np.zeros(len(template[0]), bool) for _ in range(2))
-    closed = judge.shown(template)
     for trained_again in range(rounds + 1):
         if trained_again:
             appearance.begin_again(unjustified, opened)

@@ -76,9 +76,9 @@ class Refinement:
             return surface
         steps.fact(f"{self.name}_kept", False)
         template = template_of(fit.scene.subject, surface)
-        appearance = SurfaceRadiance(template.start, template.faces, fit.views, fit.training,
-                                     fit.config.radiance, seed=fit.config.seed, glossy=True)
-        start = template.start
+        start, judge = template.start, fit.held_out_judge
+        appearance = SurfaceRadiance(start, template.faces, fit.views, fit.training, fit.config.radiance,
+                                     seed=fit.config.seed, mirrored=judge.shown(template.surface).mirrored)
         if self.first:
             appearance.move(mi.Float(start.ravel()))
             appearance.refit_anew(template.solid)

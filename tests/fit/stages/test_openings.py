@@ -52,7 +52,9 @@ class ScriptedRadiance:
 def found_openings(appearance: ScriptedRadiance, rounds: int = 3) -> np.ndarray:
     clean = partial(clean_opacity, vertices=VERTICES, faces=FACES, min_area=0.005)
     judge = ScriptedJudge(len(VERTICES), appearance.error)
-    return find_openings(appearance, (VERTICES, FACES), judge, rounds, clean, appearance.train) <= 0
+    template = VERTICES, FACES
+    return find_openings(appearance, template, judge, judge.shown(template), rounds, clean,
+                         appearance.train) <= 0
 
 
 @pytest.mark.parametrize(("false", "behind", "openings", "rounds"), [
