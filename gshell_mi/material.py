@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -110,16 +108,10 @@ def given_material(bsdf: mi.BSDF) -> dict:
     return found
 
 
-def principled(base_color: mi.Texture | None = None) -> dict:
-    """A two-sided principled BSDF that reads the mesh's attributes, for ``mi.load_dict``.
-
-    Args:
-        base_color: another texture for the base colour.
-    """
-    textures: dict[str, Any] = {parameter: {"type": "mesh_attribute", "name": attribute}
+def principled() -> dict:
+    """A two-sided principled BSDF that reads the mesh's attributes, for ``mi.load_dict``."""
+    textures = {parameter: {"type": "mesh_attribute", "name": attribute}
                 for attribute, parameter in ATTRIBUTES.items()}
-    if base_color is not None:
-        textures["base_color"] = base_color
     return {"type": "twosided", "bsdf": {"type": "principled", **textures}}
 
 

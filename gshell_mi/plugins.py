@@ -15,7 +15,6 @@ from .compat import trust_only_own_plugins
 #: Modules that define a plugin class at import and register it with Mitsuba.
 PLUGIN_MODULES = (
     "gshell_mi.shape",
-    "gshell_mi.texture",
     "gshell_mi.integrators.gshell_path",
     "gshell_mi.integrators.gshell_mask",
 )

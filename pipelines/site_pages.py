@@ -39,7 +39,7 @@ LIBRARY = {
                "environment_maps", "json_files"]),
     "fit": ("Fit", "From scenes to surfaces, materials and light.", ["fit"]),
     "losses": ("Losses, material, light", "What a fit minimises, and what it changes beside the surface.",
-               ["losses", "means", "material", "light", "extras", "texture", "color_detail", "schedules",
+               ["losses", "means", "material", "light", "extras", "subdivision", "schedules",
                 "outliers", "tempered_adam"]),
     "evaluation": ("Evaluation", "How good a result is.", ["evaluation", "compare"]),
     "export": ("Export", "What a fit leaves behind, and what can be made of it.",

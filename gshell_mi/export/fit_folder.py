@@ -6,18 +6,17 @@ import dataclasses
 import json
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
-import trimesh
 
 from ..files import replacing
 from ..images import over_white, psnr, triptych, write_png
 from ..light import turns_with_camera
 from ..own_folder import OwnFolder
 from ..scene_files import load_scene
+from ..subdivision import subdivided
 from ..topology import topology
 from ..triangles import unit
 from .ply import write_ply
@@ -25,7 +24,6 @@ from .slivers import without_slivers
 from .stock_scene import MAX_DEPTH, write_light, write_scene
 
 if TYPE_CHECKING:
-    from ..color_detail import ColorDetail
     from ..extraction import SurfaceMesh
     from ..light import EnvironmentLight
     from ..material import GivenMaterial, MaterialField
@@ -35,15 +33,16 @@ _EXPORT_SPP = 32
 
 
 def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMaterial,
-               light: EnvironmentLight | None, views: int, detail: ColorDetail | None = None, *,
-               light_turns: bool = False) -> dict:
+               light: EnvironmentLight | None, views: int, texture: np.ndarray | None = None,
+               texture_levels: int = 0, *, light_turns: bool = False) -> dict:
     """Writes meshes, light, scene and triptychs.
 
     Args:
         fit: its subject is the result.
         light: None if it is the scene's own.
         views: how many, spread evenly, are rendered.
-        detail: of the base colour. Triangles are split in four, so that their vertices hold it.
+        texture: base colours at the vertices of the surface's mesh, divided ``texture_levels`` times; None
+            leaves those of the material.
         light_turns: whether the light turns with the camera: then it is stored as the first view has it.
 
     Returns:
@@ -58,7 +57,7 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
         channels = 3 if name == "vertex_color" else 1
         values = np.array(surface.interpolate(field, channels).numpy())
         attributes[name] = values.T if channels == 3 else values
-    _write_surface(output / "mesh.ply", surface, attributes, detail)
+    _write_surface(output / "mesh.ply", surface, attributes, texture, texture_levels)
     template = fit.subject.template()
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
     write_light(output / "light.exr", fit.light, light)
@@ -87,19 +86,13 @@ def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dic
 
 
 def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.ndarray],
-                   detail: ColorDetail | None = None) -> None:
+                   texture: np.ndarray | None = None, levels: int = 0) -> None:
     vertices, faces, _ = surface.to_numpy()
     normals = np.array(surface.vertex_normals().numpy()).T.reshape(-1, 3)
     vertices = without_slivers(vertices, faces, normals)
-    if detail and len(faces):
-        divided: Any = trimesh.remesh.subdivide(vertices, faces, vertex_attributes={
-            "normal": normals} | attributes)
-        vertices, faces, values = divided  # two of them without attributes
-        normals, attributes = unit(values.pop("normal")), values
-        color = mi.Color3f(np.ascontiguousarray(attributes["vertex_color"].T, np.float32))
-        point = mi.Point3f(np.ascontiguousarray(vertices.T, np.float32))
-        with dr.suspend_grad():
-            attributes["vertex_color"] = detail.color(color, point).numpy().T
+    if texture is not None:
+        vertices, faces, attributes = subdivided(vertices, faces, {"normal": normals} | attributes, levels)
+        normals, attributes["vertex_color"] = unit(attributes.pop("normal")), texture
     write_ply(path, vertices, faces, normals, attributes)
 
 

@@ -158,7 +158,8 @@ def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report:
     with progress.stage("export", None), runner.timed("export"):
         fitted = Fitted.of(fit, surface)
         metrics = export_fit(output, fit.scene, fitted.material, fitted.light, fit.config.triptychs,
-                             fitted.detail, light_turns=fit.config.light_frame == "camera")
+                             fitted.texture, fitted.texture_levels,
+                             light_turns=fit.config.light_frame == "camera")
         metrics["config"] = dataclasses.asdict(fit.config)
         metrics |= fitted.findings(fit, progress.warn) | {"warnings": progress.warnings}
 

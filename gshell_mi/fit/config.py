@@ -16,6 +16,7 @@ from .stages.hull import HullConfig
 from .stages.joint import DetailConfig, JointConfig
 from .stages.openings import OpeningsConfig
 from .stages.refinement import FoldsConfig, RefinementConfig
+from .stages.texture import TextureConfig
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,8 @@ class FitConfig:
     """Geometry, material and light by path tracing."""
     detail: DetailConfig = field(default_factory=DetailConfig)
     """The joint stage continued on a finer lattice."""
+    texture: TextureConfig = field(default_factory=TextureConfig)
+    """Colours as fine as the images."""
 
     @classmethod
     def for_effort(cls, effort: Effort, **changes: Any) -> FitConfig:
@@ -143,7 +146,7 @@ Effort = Literal["preview", "normal", "thorough"]
 _PREVIEW = {"resolution": 48, "iterations": 70, "triptychs": 4, "radiance.batch": 16384,
             "openings.iterations": 600, "openings.rounds": 0, "cavities.iterations": 0,
             "refinement.iterations": 0, "volume.iterations": 0, "render.views": 1, "render.primal_spp": 4,
-            "render.max_depth": 2, "model.even_start": False, "model.light_height": 16,
+            "render.max_depth": 2, "model.even_start": False, "model.light_height": 16, "texture.rounds": 1,
             "joint.color_hold": 0.0, "joint.revision": 1.0}
 
 #: Twice as many steps of every stage.

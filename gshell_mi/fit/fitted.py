@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from ..color_detail import ColorDetail
 from ..diagnostics import diagnose
+from ..extraction import SurfaceMesh
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, given_material
 from .joint.depth import depth_error
@@ -27,14 +27,17 @@ class Fitted:
     Attributes:
         material: on the surface's lattice.
         light: None if it is the scene's own.
-        detail: of the base colour; None if there is none.
+        texture: (V, 3) base colours of the surface's mesh, divided ``texture_levels`` times; or None.
         scene: of the surface under that light.
+        mesh: the surface's.
     """
 
     material: MaterialField | GivenMaterial
     light: EnvironmentLight | None
-    detail: ColorDetail | None
+    texture: np.ndarray | None
+    texture_levels: int
     scene: mi.Scene
+    mesh: SurfaceMesh
 
     @classmethod
     def of(cls, fit: Fit, surface: Surface) -> Fitted:
@@ -47,14 +50,18 @@ class Fitted:
         else:
             material = MaterialField(np.zeros((count, 3)), **given)
             material.parameters = {name: mi.Float(surface.model[name]) for name in material.parameters}
-        light, detail = start_light(fit.scene, surface, config), None
-        if "detail_places" in surface.model:
-            to_lattice = mi.Transform4f(subject.to_world).inverse()
-            side = config.model.color_voxels * max(surface.lattice.resolution, fit.lattices.last.resolution)
-            vertices = to_lattice @ mi.Point3f(subject.surface.vertices)
-            detail = ColorDetail(vertices.numpy().T, side, to_lattice)
-            detail.restore(surface.model)
-        return cls(material, light, detail, optimised_scene(fit.scene, light))
+        light, model = start_light(fit.scene, surface, config), surface.model
+        return cls(material, light, model.get("texture"), int(model.get("texture_levels", 0)),
+                   optimised_scene(fit.scene, light), subject.surface)
+
+    def attributes(self) -> dict[str, np.ndarray]:
+        """The material at the vertices of the surface's mesh, (V, 3) or (V,), by attribute name."""
+        found = {}
+        for name, field in self.material.values().items():
+            channels = 3 if name == "vertex_color" else 1
+            values = np.array(self.mesh.interpolate(field, channels).numpy())
+            found[name] = values.T if channels == 3 else values
+        return found
 
     def findings(self, fit: Fit, warn: Callable[[str], None]) -> dict:
         """Entries of ``metrics.json``: ``diagnostics`` and, with depth maps, ``depth_error``.

@@ -22,7 +22,7 @@ _MOVED = {
                                                    "radiance-lr", "direction-lr", "mask", "distortion")},
     "render": {"step-views": "views"} | {name: name for name in ("spp", "primal-spp", "max-depth",
                                                                  "gradient-depth", "reparam-depth")},
-    "model": {name: name for name in ("field", "color-voxels", "light-height")}
+    "model": {name: name for name in ("field", "light-height")}
              | {"flexicubes-weights": "field flexicubes", "no-even-start": "no-even-start"},
     "losses": {"image-loss": "image", "joint-mask": "mask", "joint-depth": "depth"}
               | {name: name for name in ("material-smoothness", "light-grey", "flexicubes-deviation")}
@@ -37,7 +37,7 @@ _MOVED = {
 }
 
 #: Flags that nothing has taken the place of.
-GONE = ("ghost-gain", "vessel-gain", "refinement-gain", "folds-gain")
+GONE = ("color-voxels", "ghost-gain", "vessel-gain", "refinement-gain", "folds-gain")
 
 #: The new flag of each old one, without dashes.
 RENAMED = {old: f"{group}.{new}" if group else new for group, names in _MOVED.items()

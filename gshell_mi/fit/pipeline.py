@@ -13,6 +13,7 @@ from .stages.joint import Joint
 from .stages.openings import Openings
 from .stages.refinement import Refinement
 from .stages.revoxelise import Revoxelise
+from .stages.texture import Texture
 from .stages.volume import Volume
 
 
@@ -38,10 +39,13 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
         start.append(Volume(config.volume))                         # another start, if it is better
     # Networks are not tied to a lattice: theirs is the last one from the start.
     explicit = parametrisation_named(config.model.field).is_explicit
-    if not (config.iterations and config.detail.iterations and explicit):
-        return [*start, Joint("joint", config.joint, config.iterations, lattices.last)]
-    return [
-        *start,
-        Joint("joint", config.joint, config.iterations, lattices.late),     # shape, material and light
-        Joint("detail", config.detail, config.detail.iterations, lattices.last, refines=True),
-    ]
+    if config.iterations and config.detail.iterations and explicit:
+        start += [
+            Joint("joint", config.joint, config.iterations, lattices.late),     # shape, material and light
+            Joint("detail", config.detail, config.detail.iterations, lattices.last, refines=True),
+        ]
+    else:
+        start.append(Joint("joint", config.joint, config.iterations, lattices.last))
+    if config.iterations and config.texture.rounds:
+        start.append(Texture(config.texture))                       # colours as fine as the images
+    return start

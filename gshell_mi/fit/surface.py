@@ -58,7 +58,7 @@ class Surface:
         hull: (n,) the signed distance before thin parts were grown; None where none were.
         seen: what was seen there; None before anything was looked at.
         moved: where stages have moved its template, the best first.
-        model: material, light and colour detail that a joint stage has left, flat arrays by name.
+        model: material, light and texture that later stages have left, flat arrays by name.
         revision: what a topology revision has changed, for the stages after it; flat arrays by name.
     """
 

@@ -25,21 +25,22 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
 
 
 @pytest.mark.parametrize(("settings", "expected"), [
-    ({}, ["hull", *START, "volume", "joint", "detail"]),
-    ({"volume.iterations": 0}, ["hull", *START, "joint", "detail"]),
+    ({}, ["hull", *START, "volume", "joint", "detail", "texture"]),
+    ({"volume.iterations": 0}, ["hull", *START, "joint", "detail", "texture"]),
     ({"iterations": 0}, ["hull", *START, "volume", "joint"]),
-    ({"detail.iterations": 0}, ["hull", *START, "volume", "joint"]),
-    ({"model.field": "hashgrid"}, ["hull", *START, "volume", "joint"]),
-    ({"model.field": "flexicubes"}, ["hull", *START, "volume", "joint", "detail"]),
+    ({"detail.iterations": 0}, ["hull", *START, "volume", "joint", "texture"]),
+    ({"model.field": "hashgrid"}, ["hull", *START, "volume", "joint", "texture"]),
+    ({"texture.rounds": 0}, ["hull", *START, "volume", "joint", "detail"]),
+    ({"model.field": "flexicubes"}, ["hull", *START, "volume", "joint", "detail", "texture"]),
 ])
 def test_stages_from_masks(settings, expected):
     assert names(mi.load_dict({"type": "gshell", "resolution": 12}), settings) == expected
 
 
 @pytest.mark.parametrize(("opened", "settings", "expected"), [
-    (True, {}, ["given", "joint", "detail"]),
-    (False, {}, ["given", *START, "joint", "detail"]),
-    (True, {"watertight": True}, ["given", *START, "joint", "detail"]),
+    (True, {}, ["given", "joint", "detail", "texture"]),
+    (False, {}, ["given", *START, "joint", "detail", "texture"]),
+    (True, {"watertight": True}, ["given", *START, "joint", "detail", "texture"]),
 ])
 def test_stages_from_given_fields(tmp_path, opened, settings, expected):
     ball = sphere(TetLattice(12))

@@ -35,9 +35,6 @@ class ModelConfig:
     field: str = "explicit"
     """What the geometry is optimised as: the lattice's values themselves, or a parametrisation that is
     registered under this name (gshell_mi.extras has some)."""
-    color_voxels: int = 0
-    """Voxels per cell of the last lattice that the base colour has around the surface, which makes it as fine
-    as the images; 0 leaves it to the lattice's vertices."""
     even_start: bool = True
     """Start from one base colour, the median of those that the images show, if the light is sought;
     otherwise from what they show, shading and all."""

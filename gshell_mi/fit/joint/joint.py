@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 
 from ... import losses
-from ...color_detail import ColorDetail, moved
 from ...errors import UserError
 from ...fields import LatticeFields
 from ...fields.smoothing import LatticeDiffusion
@@ -60,18 +58,13 @@ class JointStage:
     """
 
     def __init__(self, fit: FitScene, material: MaterialField | GivenMaterial, light: EnvironmentLight | None,
-                 config: FitConfig, detail_side: int = 0, *, stage: JointConfig | None = None,
+                 config: FitConfig, *, stage: JointConfig | None = None,
                  iterations: int | None = None):
         self.fit, self.material, self.light, self.config = fit, material, light, config
         self.stage = stage or config.joint
         self.iterations = config.iterations if iterations is None else iterations
         self.subject = fit.subject
-        self.detail = self._color_detail(detail_side)
-        texture = None
-        if self.detail:
-            texture = mi.load_dict({"type": "gshell_color"})
-            texture.detail = self.detail
-        self.subject.set_bsdf(mi.load_dict(principled(texture)))
+        self.subject.set_bsdf(mi.load_dict(principled()))
         for name, field in material.values().items():
             self.subject.attach_attribute(name, field)
         self.scene = optimised_scene(fit, light)
@@ -98,10 +91,6 @@ class JointStage:
         #: The lattice fields of the present step, with gradients enabled; none before the geometry moves.
         self.fields: dict[str, mi.Float] = {}
         self.material_optimizer = mi.ad.Adam(lr=stage.material_lr, params=material.parameters)
-        self.detail_optimizer = mi.ad.Adam(lr=stage.material_lr)
-        if self.detail:
-            self.detail_optimizer["detail"] = self.detail.values
-            self._detail_parameter = next(name for name in self.parameters.keys() if name.endswith(".detail"))
         # What a mean over all pixels says of one texel may be smaller than the epsilon that is usual.
         self.light_optimizer = TemperedAdam(lr=stage.light_lr, epsilon=1e-12,
                                             params={"log_radiance": light.log_radiance} if light else None)
@@ -111,7 +100,7 @@ class JointStage:
     @property
     def optimizers(self) -> dict[str, mi.ad.Adam]:
         others = {"material": self.material_optimizer, "light": self.light_optimizer}
-        return self.geometry.optimizers | others | ({"detail": self.detail_optimizer} if self.detail else {})
+        return self.geometry.optimizers | others
 
     def step(self, iteration: int) -> dict[str, float]:
         """One step on ``step_views`` views; returns the losses.
@@ -148,7 +137,7 @@ class JointStage:
         with phase("backward") as compute:
             if dr.grad_enabled(sought):
                 dr.backward(sought)
-            parameters = (self.fields, self.material_optimizer, self.light_optimizer, self.detail_optimizer)
+            parameters = (self.fields, self.material_optimizer, self.light_optimizer)
             compute(*(dr.grad(value) for values in parameters for value in values.values()))
         progress = iteration / max(self.iterations, 1)
         with phase("optimiser"):
@@ -186,7 +175,6 @@ class JointStage:
     def model(self) -> dict[str, np.ndarray]:
         """Material and light as a stage on a finer lattice starts from, as host arrays, after ``finish``."""
         arrays = {name: field.numpy() for name, field in self.material.parameters.items()}
-        arrays |= self.detail_arrays()
         return arrays | ({"log_radiance": self.light.log_radiance.numpy()} if self.light else {})
 
     def preview(self) -> Preview:
@@ -236,9 +224,6 @@ class JointStage:
         self.material.parameters = {name: self.material_optimizer[name] for name in self.material.parameters}
         for name, field in self.material.values().items():
             self.parameters[f"subject.lattice_{name}"] = field
-        if self.detail:
-            self.detail.values = self.detail_optimizer["detail"]
-            self.parameters[self._detail_parameter] = self.detail.values
         if self.light:
             self.light.log_radiance = self.light_optimizer["log_radiance"]
             self.light.update(self.parameters)
@@ -249,44 +234,12 @@ class JointStage:
 
     def _follow_surface(self, *, rescan: bool) -> None:
         """Moves the blocks that the fields are stored in, and all that is stored with them."""
-        if self.detail and rescan:
-            self._follow_detail()
         carried = self.subject.follow(rescan=rescan)
         if carried is None:
             return
         self.geometry.carry(carried)
         carried.optimizer(self.material_optimizer, self.material.on_lattice)
         self.material.carry(carried)
-
-    def _color_detail(self, side: int) -> ColorDetail | None:
-        """Detail around the present surface, if the material is sought."""
-        if not side or not self.material.parameters:
-            return None
-        return ColorDetail(self._local_vertices(), side, mi.Transform4f(self.subject.to_world).inverse())
-
-    def detail_arrays(self) -> dict[str, np.ndarray]:
-        """What ``restore_detail`` needs."""
-        return self.detail.arrays() if self.detail else {}
-
-    def restore_detail(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """The detail that a stage before has left."""
-        self.detail.restore(arrays)
-        self.detail_optimizer["detail"] = self.detail.values
-
-    def _local_vertices(self) -> np.ndarray:
-        """(V, 3) of the surface, in the lattice's cube."""
-        vertices = mi.Point3f(dr.detach(self.subject.surface.vertices))
-        return (mi.Transform4f(self.subject.to_world).inverse() @ vertices).numpy().T
-
-    def _follow_detail(self) -> None:
-        """Moves the detail's voxels, and what the optimiser keeps for them, to where the surface is now."""
-        self.detail.values = dr.detach(self.detail_optimizer["detail"])
-        source = self.detail.follow(self._local_vertices())
-        _, promoted, rate, (step, first, second, largest) = self.detail_optimizer.state["detail"]
-        value = self.detail.values
-        dr.enable_grad(value)
-        self.detail_optimizer.state["detail"] = (
-            value, promoted, rate, (step, moved(first, source), moved(second, source), largest))
 
     def _step_material(self, progress: float, diffuse: LatticeDiffusion) -> None:
         config, optimizer = self.stage, self.material_optimizer
@@ -303,11 +256,6 @@ class JointStage:
             rates["vertex_color"] *= (progress / config.color_hold) ** 2
         optimizer.set_learning_rate(rates)
         optimizer.step()
-        if self.detail:
-            detail = self.detail_optimizer
-            dr.set_grad(detail["detail"], finite(dr.grad(detail["detail"])))
-            detail.set_learning_rate(rates["vertex_color"])
-            detail.step()
 
     def _step_light(self, progress: float) -> None:
         optimizer = self.light_optimizer
@@ -321,11 +269,16 @@ class JointStage:
 
 def optimised_scene(fit: FitScene, light: EnvironmentLight | None) -> mi.Scene:
     """The fit scene with the light to optimise in place of its own, and without its sensors."""
-    objects = {"type": "scene", "subject": fit.subject, "light": light.emitter() if light else fit.light}
+    return mi.load_dict({"type": "scene", "subject": fit.subject, **other_objects(fit, light)})
+
+
+def other_objects(fit: FitScene, light: EnvironmentLight | None) -> dict:
+    """All of the fit scene but its gshell shape and its sensors, with the light to optimise."""
+    objects = {"light": light.emitter() if light else fit.light}
     for index, shape in enumerate(fit.scene.shapes()):
         if shape is not fit.subject:
             objects[f"shape_{index}"] = shape
     for index, emitter in enumerate(fit.scene.emitters()):
         if emitter.id() != "light" and not emitter.is_environment() and not emitter.shape():
             objects[f"emitter_{index}"] = emitter
-    return mi.load_dict(objects)
+    return objects

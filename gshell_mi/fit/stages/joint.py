@@ -116,12 +116,9 @@ class Joint:
         subject, config = fit.scene.subject, fit.config
         fields = start_fields(subject, surface, lattice, config.band_resolution, steps.kept)
         subject.set_fields(fields)
-        finest = max(lattice.resolution, fit.lattices.last.resolution)
         joint = JointStage(fit.scene, start_material(fit.scene, surface, fields.lattice, config),
-                           start_light(fit.scene, surface, config), config,
-                           config.model.color_voxels * finest, stage=self.config, iterations=self.iterations)
-        if joint.detail and "detail_places" in (kept := surface.model | steps.kept):
-            joint.restore_detail(kept)
+                           start_light(fit.scene, surface, config), config, stage=self.config,
+                           iterations=self.iterations)
         if joint.geometry.fitting_steps and not steps.done:
             with steps.task("start", joint.geometry.fitting_steps) as advance:
                 for iteration in range(joint.geometry.fitting_steps):
@@ -131,8 +128,7 @@ class Joint:
         revised = _under(steps.kept, _REVISION) or surface.revision
         revision = TopologyRevision(joint, fit.views, fit.pixels, fit.judge, revised)
         steps.run(revision, self.iterations, joint.optimizers, lambda: (
-            _prefixed(_REVISION, revision.state()) | _prefixed(_BLOCKS, block_arrays(subject.fields()))
-            | joint.detail_arrays()))
+            _prefixed(_REVISION, revision.state()) | _prefixed(_BLOCKS, block_arrays(subject.fields()))))
         changed = revision.finish()
         if changed is not None:
             steps.fact("openings_changed", changed)
