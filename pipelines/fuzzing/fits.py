@@ -57,6 +57,9 @@ def write_reported_fit(folder: Path) -> None:
     for number in range(2):
         Image.fromarray(np.zeros((8, 24, 3), np.uint8)).save(
             folder / "out" / "views" / f"view_{number:03}.png")
+    for name, width in (("held_out", 24), ("masks", 8)):
+        (folder / "out" / name).mkdir()
+        Image.fromarray(np.zeros((8, width, 3), np.uint8)).save(folder / "out" / name / "view_001.png")
 
 
 def film(folder: Path) -> None:
