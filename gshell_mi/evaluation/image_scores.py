@@ -101,9 +101,9 @@ def view_scores(image: np.ndarray, target: Target) -> Scores:
     Where the target is not known, nothing is held against the image. ``mask_iou`` is None if the target came
     without alpha, and ``ssim`` of images below 7 pixels.
     """
-    known = target.known[..., None]
+    known = np.asarray(target.known)[..., None]
     left, right = over_white(image), over_white(known * target.rgba + (1 - known) * image)
-    counted = target.known > 0.5
+    counted = known[..., 0] > 0.5
     scores, _ = _scores(left, right, (image[..., 3] > 0.5) & counted, (target.rgba[..., 3] > 0.5) & counted)
     return scores if target.has_alpha else scores | {"mask_iou": None}
 

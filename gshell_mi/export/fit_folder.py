@@ -48,7 +48,7 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
     """
     chosen = np.unique(np.linspace(0, len(fit.sensors) - 1, views).round().astype(int))
     shown = {TRAINING: [fit.training[index] for index in chosen], HELD_OUT: fit.held_out}
-    names = [[view.sensor.id() for view in views] for views in shown.values()]
+    names = [[view.sensor.id() for view in group] for group in shown.values()]
     OwnFolder(output, "fit").claim("mesh.ply", "template.ply", "light.exr", "scene.xml", *view_files(*names))
     surface = fit.subject.surface
     attributes = {}
@@ -62,12 +62,12 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
     write_light(output / "light.exr", fit.light, light)
     write_scene(output / "scene.xml", fit.light, fit.sensors)
     scores = {}
-    for folder, views in shown.items():
-        if views:
+    for folder, group in shown.items():
+        if group:
             # The first training view has the light as it is stored.
-            turns = turns_with_camera([fit.sensors[0], *(view.sensor for view in views)])[1:]
+            turns = turns_with_camera([fit.sensors[0], *(view.sensor for view in group)])[1:]
             lights = [light.turned(turn) for turn in turns] if light and light_turns else []
-            scores[folder] = write_views(output, folder, views, lights)
+            scores[folder] = write_views(output, folder, group, lights)
     vertices, faces, _ = surface.to_numpy()
     return {
         "scene": fit.path.name,

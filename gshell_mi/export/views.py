@@ -60,7 +60,7 @@ def write_views(output: Path, folder: str, views: Sequence[View], lights: Sequen
         write_png(output / folder / f"{name}.png", triptych(target.rgba, image))
         if target.has_alpha:
             (output / MASKS).mkdir(exist_ok=True)
-            overlay = mask_overlay(target.rgba[..., 3], image[..., 3], target.known > 0.5)
+            overlay = mask_overlay(target.rgba[..., 3], image[..., 3], np.asarray(target.known) > 0.5)
             write_png(output / MASKS / f"{name}.png", overlay)
     return {"views": {name: _rounded(found) for name, found in scores.items()},
             "mean": _rounded(mean_scores(scores.values()))}
