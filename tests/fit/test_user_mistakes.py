@@ -499,7 +499,7 @@ def test_disk_full_at_a_checkpoint(told, stopped, monkeypatch):
     assert not list(stopped.glob(".*")), "no remains"
 
 
-@pytest.mark.parametrize("writer", ["_write_surface", "_write_views"])
+@pytest.mark.parametrize("writer", ["_write_surface", "write_views"])
 def test_disk_full_at_export(told, scene, tmp_path, monkeypatch, writer):
     output = tmp_path / "out"
     with monkeypatch.context() as patch:
