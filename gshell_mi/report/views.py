@@ -72,6 +72,9 @@ def _worst(paths: Iterable[Path], views: Mapping[str, Scores], score: str) -> li
 
 def _triptych(path: Path) -> np.ndarray:
     pixels = _pixels(path)
+    if pixels.shape[1] < 3:
+        raise UserError(f"'{path}' is too narrow for three pictures side by side; remove it, or run the fit "
+                        f"again.")
     return pixels[:, :pixels.shape[1] // 3 * 3]
 
 

@@ -170,6 +170,14 @@ def test_damaged_files_of_a_fit(folder, tmp_path, capsys, name, words, damage):
     assert words in error and error.startswith("error: ") and error.count("\n") == 1
 
 
+@pytest.mark.parametrize("name", ["views/view_000.png", "held_out/view_003.png"])
+def test_a_picture_that_is_no_triptych(folder, tmp_path, name):
+    shutil.copytree(folder, tmp_path / "fit")
+    Image.new("RGB", (2, 9)).save(tmp_path / "fit" / name)
+    with pytest.raises(UserError, match="is too narrow for three pictures"):
+        write_report(tmp_path / "fit", ReportConfig(turntable_frames=1, turntable_size=16, turntable_spp=1))
+
+
 def test_a_report_of_somebody_elses_is_kept(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "fit")
     OwnFolder(tmp_path / "fit", "fit").write_mark(["mesh.glb"])
