@@ -46,6 +46,26 @@ def triptych(target: np.ndarray, fit: np.ndarray) -> np.ndarray:
     return np.concatenate([left, middle, np.clip(4 * np.abs(left - middle), 0, 1)], axis=1)
 
 
+#: Colours of ``mask_overlay``, sRGB, which the colour-blind tell apart.
+BOTH, UNKNOWN = (0.78, 0.78, 0.78), (0.94, 0.92, 0.80)
+MASK_ONLY, FIT_ONLY = (0.0, 0.45, 0.70), (0.90, 0.45, 0.0)
+
+
+def mask_overlay(target: np.ndarray, fit: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Where two masks differ: (h, w, 3) sRGB, white where neither is.
+
+    Args:
+        target, fit: (h, w) coverage, which counts from 1/2 on.
+        known: (h, w) booleans, where the target's means anything.
+    """
+    target, fit = target > 0.5, fit > 0.5
+    overlay = np.ones((*target.shape, 3))
+    for chosen, color in ((target & fit, BOTH), (target & ~fit, MASK_ONLY), (fit & ~target, FIT_ONLY),
+                          (~known, UNKNOWN)):
+        overlay[chosen] = color
+    return overlay
+
+
 def write_png(path: Path, image: np.ndarray) -> None:
     """Writes (h, w, 3) sRGB values in [0, 1]."""
     with replacing(path) as partial:

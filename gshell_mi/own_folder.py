@@ -26,7 +26,8 @@ TAG = "written by gshell_mi"
 KINDS = {
     "fit": ("scene.xml", "mesh.ply", "template.ply", "light.exr", "metrics.json", "log.jsonl",
             "checkpoint.npz", "mesh.glb", "report.html", "mesh.obj", "mesh.mtl", "mesh_base_color.png",
-            "mesh_roughness.png", "mesh_metallic.png", "mesh_normal.png", "remeshed.ply", "views/*.png"),
+            "mesh_roughness.png", "mesh_metallic.png", "mesh_normal.png", "remeshed.ply", "views/*.png",
+            "held_out/*.png", "masks/*.png"),
     "capture": ("sensors.xml", "test.xml", "capture.json", "check.png", "light.*", "view_*.exr",
                 "test/test_*.exr"),
     "dataset": ("dataset.json", "statistics.json", "sheet.png", "shards/*.npz"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
@@ -16,12 +16,25 @@ from .errors import UserError
 from .files import locked, name_trouble, remove_stale, replacing
 from .scene_files import load_scene
 from .targets import Target, depth_file, known_file, load_target
+from .wording import counted
 
 #: Where no target has more alpha than this, the object would be half transparent.
 _FULL = 0.95
 
 #: Samples per pixel of targets rendered from a scene's reference.
 REFERENCE_SPP = 128
+
+
+#: Views that a fit needs at least once some are held out: of a single one nothing is to be learnt in space.
+_LEAST_VIEWS = 2
+
+
+@dataclass(frozen=True)
+class View:
+    """A sensor and its image."""
+
+    sensor: mi.Sensor
+    target: Target
 
 
 @dataclass(frozen=True)
@@ -36,6 +49,7 @@ class FitScene:
         light: its emitter ``light`` (``constant`` or ``envmap``).
         sensors: the training views.
         targets: their images, in the same order.
+        held_out: views that nothing is fitted to, for scores.
     """
 
     path: Path
@@ -45,6 +59,12 @@ class FitScene:
     light: mi.Emitter
     sensors: list[mi.Sensor]
     targets: list[Target]
+    held_out: list[View] = field(default_factory=list)
+
+    @property
+    def training(self) -> list[View]:
+        """The training views."""
+        return [View(*pair) for pair in zip(self.sensors, self.targets, strict=True)]
 
     @property
     def name(self) -> str:
@@ -63,11 +83,11 @@ class FitScene:
     @property
     def target_files(self) -> set[Path]:
         """The files of the targets, and those beside them that say more of them."""
-        return {file for target in self.targets for path in [target.path]
+        return {file for view in (*self.training, *self.held_out) for path in [view.target.path]
                 for file in (path, depth_file(path), known_file(path)) if file is not None}
 
 
-def load_fit_scene(path: Path, targets: Path | None = None, *,
+def load_fit_scene(path: Path, targets: Path | None = None, *, hold_out: int = 0,
                    before_targets: Callable[[mi.Shape, list[mi.Sensor]], None] | None = None,
                    on_reference: Callable[[int, int], None] | None = None) -> FitScene:
     """Loads and checks a fit scene with its targets.
@@ -75,14 +95,15 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
     Args:
         path: the XML file.
         targets: folder of ``<sensor id>.exr``; default: the folder beside the XML with its stem.
+        hold_out: every so many-th view, from the first one on, is held out; 0 for none.
         before_targets: called with the gshell shape and the sensors before any target is rendered or read.
         on_reference: called with (views done, views) while missing targets are rendered from
             ``reference.xml``.
 
     Raises:
         UserError: the file is missing or not a Mitsuba scene, it has not exactly one gshell shape, no
-            emitter ``light``, no sensors, sensors of the same id or of one that cannot be a file's name, or a
-            target is missing or unusable.
+            emitter ``light``, no sensors, sensors of the same id or of one that cannot be a file's name, too
+            few views are left, or a target is missing or unusable.
     """
     path = Path(path)
     if not path.is_file():
@@ -101,16 +122,26 @@ def load_fit_scene(path: Path, targets: Path | None = None, *,
         if trouble := name_trouble(name):
             raise UserError(f"The id {name[:80]!r} of a sensor of scene '{path}' {trouble}; targets and "
                             f"results are files of these names: give it one such as \"view_000\".")
+    held_out = range(0, len(sensors), hold_out) if hold_out else range(0)
+    kept = len(sensors) - len(held_out)
+    if held_out and kept < _LEAST_VIEWS:
+        raise UserError(f"--hold-out {hold_out} leaves {kept} of the {counted(len(sensors), 'view')} of "
+                        f"'{path}', and a fit needs {_LEAST_VIEWS} at least; give a greater number, add "
+                        f"views, or hold none out.")
     if before_targets:
         before_targets(subject, sensors)
     folder = Path(targets) if targets else path.with_suffix("")
     if targets is None:
         render_missing_targets(folder / "reference.xml", folder, sensors, on_reference)
-    loaded = [load_target(folder / f"{sensor.id()}.exr", *sensor.film().crop_size()) for sensor in sensors]
+    views = [View(sensor, load_target(folder / f"{sensor.id()}.exr", *sensor.film().crop_size()))
+             for sensor in sensors]
+    training = [view for index, view in enumerate(views) if index not in held_out]
+    loaded = [view.target for view in training]
     if not any(target.rgba[..., 3].any() for target in loaded):
         raise UserError(f"The targets in '{folder}' show no object: their alpha is 0 everywhere; "
                         f"write coverage into it.")
-    return FitScene(path, scene, subject, subject.bsdf(), light, sensors, loaded)
+    return FitScene(path, scene, subject, subject.bsdf(), light, [view.sensor for view in training], loaded,
+                    [views[index] for index in held_out])
 
 
 def _the_subject(scene: mi.Scene, path: Path) -> mi.Shape:

@@ -78,7 +78,8 @@ def prepare(folder: Path) -> None:
     (folder / "fit").mkdir()
     write_fit(folder / "fit", open_sphere(3))
     (folder / "fit" / "metrics.json").write_text(json.dumps({
-        "scene": "a.xml", "psnr_training": 30.0, "psnr_per_view": {}, "versions": {}, "config": {},
+        "scene": "a.xml", "psnr_training": 30.0, "versions": {}, "config": {},
+        "training": {"views": {}, "mean": {"psnr": 30.0}},
         "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1},
         "seconds": {"total": 1.0}}))
     (folder / "set").mkdir()

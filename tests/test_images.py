@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gshell_mi.images import over_white, psnr, srgb, triptych, write_png
+from gshell_mi.images import (
+    BOTH,
+    FIT_ONLY,
+    MASK_ONLY,
+    UNKNOWN,
+    mask_overlay,
+    over_white,
+    psnr,
+    srgb,
+    triptych,
+    write_png,
+)
 
 
 @pytest.mark.parametrize(("linear", "encoded"), [
@@ -45,6 +56,12 @@ def test_triptych():
     np.testing.assert_array_equal(image[:, 6:12], over_white(fit))
     np.testing.assert_allclose(image[2, 15], [4 * 12.92 * 0.001, 1, 0])
     assert np.count_nonzero(image[:, 12:]) == 2
+
+
+def test_mask_overlay():
+    target, fit = np.array([[0, 0.4, 0.6, 1, 1]]), np.array([[0, 0.6, 0.4, 1, 1]])
+    overlay = mask_overlay(target, fit, np.array([[True, True, True, True, False]]))
+    np.testing.assert_array_equal(overlay, [[(1, 1, 1), FIT_ONLY, MASK_ONLY, BOTH, UNKNOWN]])
 
 
 def test_png_round_trip(tmp_path):

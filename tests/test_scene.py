@@ -45,6 +45,25 @@ def test_loads_what_the_contract_names(scene):
     assert all(target.rgba.shape == (SIZE, SIZE, 4) for target in fit.targets)
 
 
+def test_views_are_held_out(scene):
+    fit, every = load_fit_scene(scene, hold_out=5), load_fit_scene(scene)
+    held_out = ["view_000", "view_005", "view_010"]
+    assert [view.sensor.id() for view in fit.held_out] == held_out and every.held_out == []
+    assert [sensor.id() for sensor in fit.sensors] == [name for name in IDS if name not in held_out]
+    for view in (*fit.training, *fit.held_out):
+        assert view.target.path.stem == view.sensor.id()
+    assert fit.target_files == every.target_files and len(fit.target_files) == VIEWS
+
+
+@pytest.mark.parametrize(("hold_out", "left"), [(1, 0), (2, 6), (12, 11), (99, 11)])
+def test_two_views_are_left_at_least(scene, hold_out, left):
+    if left:
+        assert len(load_fit_scene(scene, hold_out=hold_out).sensors) == left
+    else:
+        with pytest.raises(UserError, match=r"--hold-out 1 leaves 0 of the 12 views of .*; give a greater"):
+            load_fit_scene(scene, hold_out=hold_out)
+
+
 def test_the_path_may_be_a_string(scene):
     assert load_fit_scene(str(scene)).path == scene
 

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from ..command_line import run_command
 from ..errors import UserError
-from ..evaluation import IMAGE_SCORES
+from ..evaluation import IMAGE_SCORES, Scores
 from ..files import replacing
 from ..wording import counted
 
@@ -122,8 +122,9 @@ def _show(result: dict) -> None:
         console.print(table)
 
 
-def _row(scores: dict[str, float]) -> list[str]:
-    return [f"{scores[name]:.2f}" if name in ("psnr", "delta_e") else f"{scores[name]:.4f}"
+def _row(scores: Scores) -> list[str]:
+    return ["–" if (score := scores[name]) is None else
+            f"{score:.2f}" if name in ("psnr", "psnr_inside", "delta_e") else f"{score:.4f}"
             for name in IMAGE_SCORES]
 
 

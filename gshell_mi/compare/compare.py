@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
-from ..evaluation import IMAGE_SCORES, albedo_scale, image_scores, mesh_scores, read_image
+from ..evaluation import Scores, albedo_scale, image_scores, mean_scores, mesh_scores, read_image
 from ..evaluation.mesh_scores import read_mesh
 from ..export.fitted_scene import load_fitted_scene
 from ..images import over_white, write_png
@@ -38,7 +38,7 @@ def compare_folders(first: Path, second: Path, errors: Path | None = None) -> di
     views = {}
     for name, (image, reference) in pairs.items():
         views[name] = _score(name, read_image(image), read_image(reference), errors)
-    return {"views": views, "mean": _mean(views), "unmatched": unmatched}
+    return {"views": views, "mean": mean_scores(views.values()), "unmatched": unmatched}
 
 
 def compare_meshes(first: Path, second: Path) -> dict:
@@ -89,13 +89,13 @@ def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | No
     names = [camera.id() for camera in cameras]
     views = {name: _score(name, image, reference, errors)
              for name, image, reference in zip(names, images, references, strict=True)}
-    result = {"views": views, "mean": _mean(views)}
+    result = {"views": views, "mean": mean_scores(views.values())}
     if envmap:
         scale = albedo_scale(images, references)
         factors = np.append(scale, 1.0)
         scaled = {name: image_scores(image * factors, reference)[0]
                   for name, image, reference in zip(names, images, references, strict=True)}
-        result |= {"mean_albedo_scaled": _mean(scaled), "albedo_scale": scale.tolist()}
+        result |= {"mean_albedo_scaled": mean_scores(scaled.values()), "albedo_scale": scale.tolist()}
     if mesh:
         result |= compare_meshes(folder / "mesh.ply", mesh)
     return result
@@ -127,7 +127,7 @@ def _pairs(first: Path, second: Path) -> tuple[dict[str, tuple[Path, Path]], lis
     return {name: (ours[name], theirs[name]) for name in names}, unmatched
 
 
-def _score(name: str, image: np.ndarray, reference: np.ndarray, errors: Path | None) -> dict[str, float]:
+def _score(name: str, image: np.ndarray, reference: np.ndarray, errors: Path | None) -> Scores:
     try:
         scores, flip = image_scores(image, reference)
     except UserError as error:
@@ -136,7 +136,3 @@ def _score(name: str, image: np.ndarray, reference: np.ndarray, errors: Path | N
         errors.mkdir(parents=True, exist_ok=True)
         write_png(errors / f"{name}.png", np.concatenate([over_white(reference), over_white(image), flip], 1))
     return scores
-
-
-def _mean(views: dict[str, dict[str, float]]) -> dict[str, float]:
-    return {score: float(np.mean([scores[score] for scores in views.values()])) for score in IMAGE_SCORES}

@@ -12,16 +12,15 @@ import mitsuba as mi
 import numpy as np
 
 from ..files import replacing
-from ..images import over_white, psnr, triptych, write_png
 from ..light import turns_with_camera
 from ..own_folder import OwnFolder
-from ..scene_files import load_scene
 from ..subdivision import subdivided
 from ..topology import topology
 from ..triangles import unit
 from .ply import write_ply
 from .slivers import without_slivers
-from .stock_scene import MAX_DEPTH, write_light, write_scene
+from .stock_scene import write_light, write_scene
+from .views import HELD_OUT, TRAINING, view_files, write_views
 
 if TYPE_CHECKING:
     from ..extraction import SurfaceMesh
@@ -29,18 +28,16 @@ if TYPE_CHECKING:
     from ..material import GivenMaterial, MaterialField
     from ..scene import FitScene
 
-_EXPORT_SPP = 32
-
 
 def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMaterial,
                light: EnvironmentLight | None, views: int, texture: np.ndarray | None = None,
                texture_levels: int = 0, *, light_turns: bool = False) -> dict:
-    """Writes meshes, light, scene and triptychs.
+    """Writes meshes, light, scene and pictures of the views.
 
     Args:
         fit: its subject is the result.
         light: None if it is the scene's own.
-        views: how many, spread evenly, are rendered.
+        views: how many training views, spread evenly, are rendered; of those held out, all are.
         texture: base colours at the vertices of the surface's mesh, divided ``texture_levels`` times; None
             leaves those of the material.
         light_turns: whether the light turns with the camera: then it is stored as the first view has it.
@@ -48,9 +45,10 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
     Returns:
         The metrics, which ``write_metrics`` stores.
     """
-    shown = np.unique(np.linspace(0, len(fit.sensors) - 1, views).round().astype(int))
-    OwnFolder(output, "fit").claim("mesh.ply", "template.ply", "light.exr", "scene.xml",
-                                   *(f"views/{fit.sensors[index].id()}.png" for index in shown))
+    chosen = np.unique(np.linspace(0, len(fit.sensors) - 1, views).round().astype(int))
+    shown = {TRAINING: [fit.training[index] for index in chosen], HELD_OUT: fit.held_out}
+    names = [[view.sensor.id() for view in group] for group in shown.values()]
+    OwnFolder(output, "fit").claim("mesh.ply", "template.ply", "light.exr", "scene.xml", *view_files(*names))
     surface = fit.subject.surface
     attributes = {}
     for name, field in material.values().items():
@@ -62,14 +60,20 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
     write_light(output / "light.exr", fit.light, light)
     write_scene(output / "scene.xml", fit.light, fit.sensors)
-    turns = turns_with_camera(fit.sensors) if light and light_turns else []
-    scores = _write_views(output, fit, shown, [light.turned(turn) for turn in turns] if light else [])
+    scores = {}
+    for folder, group in shown.items():
+        if group:
+            # The first training view has the light as it is stored.
+            turns = turns_with_camera([fit.sensors[0], *(view.sensor for view in group)])[1:]
+            lights = [light.turned(turn) for turn in turns] if light and light_turns else []
+            scores[folder] = write_views(output, folder, group, lights)
     vertices, faces, _ = surface.to_numpy()
     return {
         "scene": fit.path.name,
         "targets": str(fit.targets[0].path.parent.absolute()),
-        "psnr_training": round(float(np.mean(list(scores.values()))), 3),
-        "psnr_per_view": {name: round(score, 3) for name, score in scores.items()},
+        "psnr_training": scores[TRAINING]["mean"]["psnr"],
+        "training": scores[TRAINING],
+        **({"held_out": scores[HELD_OUT]} if fit.held_out else {}),
         "counts": dataclasses.asdict(topology(vertices, faces)),
         "versions": {name: version(name) for name in ("gshell_mi", "mitsuba", "drjit", "numpy")},
         "variant": mi.variant(),
@@ -94,26 +98,3 @@ def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.nd
         vertices, faces, attributes = subdivided(vertices, faces, {"normal": normals} | attributes, levels)
         normals, attributes["vertex_color"] = unit(attributes.pop("normal")), texture
     write_ply(path, vertices, faces, normals, attributes)
-
-
-def _write_views(output: Path, fit: FitScene, shown: np.ndarray,
-                 lights: list[mi.Transform4f]) -> dict[str, float]:
-    """Renders the exported scene from the views ``shown``; writes triptychs, returns PSNR by view id.
-
-    Args:
-        lights: per view ``to_world`` of the light, if it turns with the camera.
-    """
-    folder = output / "views"
-    folder.mkdir(exist_ok=True)
-    scene = load_scene(output / "scene.xml")
-    integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
-    scores, parameters = {}, mi.traverse(scene)
-    for index in shown:
-        sensor, target = fit.sensors[index], fit.targets[index]
-        if lights:
-            parameters["light.to_world"] = lights[index]
-            parameters.update()
-        image = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=_EXPORT_SPP))
-        scores[sensor.id()] = psnr(over_white(image), over_white(target.rgba))
-        write_png(folder / f"{sensor.id()}.png", triptych(target.rgba, image))
-    return scores

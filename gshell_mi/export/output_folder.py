@@ -10,6 +10,7 @@ from pathlib import Path
 from ..errors import UserError
 from ..files import locked, remove_stale
 from ..own_folder import KINDS, MARK, OwnFolder
+from .views import view_files
 
 #: Where a fit works as long as an earlier one is in the folder.
 _UNFINISHED = ".unfinished"
@@ -63,17 +64,18 @@ class FitFolder:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def check(self, inputs: Iterable[Path], views: Iterable[str]) -> None:
+    def check(self, inputs: Iterable[Path], views: Iterable[str], held_out: Iterable[str] = ()) -> None:
         """Checks, without a trace, what depends on the scene.
 
         Args:
             inputs: the files that the fit reads.
-            views: ids of the sensors.
+            views: ids of the training views.
+            held_out: ids of the views held out.
 
         Raises:
             UserError: an input is a file that the fit would replace, or as in the class.
         """
-        self._names = [*_FIXED, *(f"views/{view}.png" for view in views)]
+        self._names = [*_FIXED, *view_files(views, held_out)]
         own = OwnFolder(self.output, "fit")
         own.check_inputs(inputs, self._names)
         self._check_free(own)

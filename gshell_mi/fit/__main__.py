@@ -69,6 +69,7 @@ def _effort(words: list[str]) -> str:
 
 def _fit(given: _Arguments) -> None:
     # Only now, as plugins and types exist per variant.
+    from ..export.views import scores_line
     from ..viewer import Viewer
     from .api import fit_scene
 
@@ -87,6 +88,8 @@ def _fit(given: _Arguments) -> None:
           f"{counted(counts['components'], 'component')}, "
           f"{result.metrics['psnr_training']:.2f} dB on the training views, "
           f"{result.metrics['seconds']['total']:.0f} s")
+    if "held_out" in result.metrics:
+        print(f"held-out views: {scores_line(result.metrics['held_out'])}")
 
 
 def _how_to_continue(given: _Arguments) -> str:

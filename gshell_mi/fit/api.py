@@ -81,11 +81,12 @@ def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: s
             _check_settings(checkpoint.config, config.settings())
         memory = _Memory(config, report, progress)
         with progress.stage("targets", None):
-            loaded = load_fit_scene(scene, Path(targets) if targets else None, before_targets=memory.check,
-                                    on_reference=progress.reference)
+            loaded = load_fit_scene(scene, Path(targets) if targets else None, hold_out=config.hold_out,
+                                    before_targets=memory.check, on_reference=progress.reference)
             fit = Fit(loaded, config, Lattices.of(loaded.subject, config))
             _check_inputs(fit, checkpoint, resume)
-            folder.check(scene_inputs(scene) | loaded.target_files, fit.views.ids)
+            folder.check(scene_inputs(scene) | loaded.target_files, fit.views.ids,
+                         [view.sensor.id() for view in loaded.held_out])
         if not fit.pixels.has_alpha:
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
         for note in loaded.notes:

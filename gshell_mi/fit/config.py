@@ -64,6 +64,9 @@ class FitConfig:
     of every sheet, beside openings too."""
     triptychs: Annotated[int, Between(1)] = 16
     """Training views, spread evenly, that are rendered at the end: for views/ and for psnr_training."""
+    hold_out: Annotated[int, Between(0)] = 0
+    """Every so many-th view, from the first one on, is held out: no stage sees it, and it is scored at the
+    end; 0 fits to all views. 8 is usual."""
     checkpoint_seconds: float = 10.0
     """Seconds between checkpoints: what a kill loses at most."""
 

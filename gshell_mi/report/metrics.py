@@ -10,11 +10,11 @@ from ..errors import UserError
 from ..json_files import read_json
 
 #: The entries that a page cannot do without, and what they are.
-_NEEDED = {"scene": str, "psnr_training": float, "psnr_per_view": dict, "counts": dict, "seconds": dict,
+_NEEDED = {"scene": str, "psnr_training": float, "training": dict, "counts": dict, "seconds": dict,
            "versions": dict, "config": dict}
 
 #: Those that may be missing.
-_OPTIONAL = {"warnings": list, "diagnostics": dict}
+_OPTIONAL = {"warnings": list, "diagnostics": dict, "held_out": dict}
 
 #: Entries within them that a page takes for numbers.
 _NUMBERS = {"counts": ("vertices", "faces", "boundary_loops", "components"), "seconds": ("total",)}
@@ -54,9 +54,20 @@ def _problem(metrics: object) -> str | None:
         for key in keys:
             if not _is_number(metrics[name].get(key)):
                 return f"'{name}.{key}' is no number"
-    if not all(map(_is_number, metrics["psnr_per_view"].values())):
-        return "'psnr_per_view' holds what is no number"
+    for name in ("training", "held_out"):
+        if name in metrics and not _are_scores(metrics[name]):
+            return f"'{name}' holds no scores of views"
     return None
+
+
+def _are_scores(entry: dict) -> bool:
+    """Whether it has ``views`` and ``mean`` as a fit writes them: numbers, and ``psnr`` always."""
+    views = entry.get("views")
+    if not isinstance(views, dict):
+        return False
+    return all(isinstance(scores, dict) and _is_number(scores.get("psnr"))
+               and all(score is None or _is_number(score) for score in scores.values())
+               for scores in (*views.values(), entry.get("mean")))
 
 
 def _is_number(value: object) -> bool:

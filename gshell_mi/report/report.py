@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import tempfile
 from dataclasses import dataclass
 from importlib.resources import files
@@ -13,21 +11,26 @@ import jinja2
 import mitsuba as mi
 import numpy as np
 from markupsafe import Markup
-from PIL import Image
 
 from ..environment_maps import read_environment_map
 from ..errors import UserError
 from ..export.asset import write_asset
 from ..files import replacing
-from ..images import srgb
+from ..images import BOTH, FIT_ONLY, MASK_ONLY, UNKNOWN, srgb
 from ..own_folder import TAG, own_folder
 from ..turntable import TurntableConfig, render_turntable, write_video
 from ..wording import counted
 from .curves import curves
+from .data_urls import data_url, image_url
 from .metrics import read_metrics
 from .viewer_model import viewer_model
+from .views import HEADINGS, held_out_pictures, mask_pictures, score_rows, training_pictures
 
 _PROBE_HEIGHT = 160
+
+#: Of the overlays, as CSS writes them.
+_COLORS = {name: "#" + "".join(f"{round(255 * part):02x}" for part in color) for name, color in (
+    ("both", BOTH), ("mask_only", MASK_ONLY), ("fit_only", FIT_ONLY), ("unknown", UNKNOWN))}
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,7 @@ def _write(folder: Path, metrics: dict, config: ReportConfig) -> Path:
         write_asset(folder)
     with tempfile.TemporaryDirectory() as place:
         (video,) = write_video(frames, Path(place) / "turntable.mp4", turntable.fps, gif=False)
-        video_data = _data_url("video/mp4", video.read_bytes())
+        video_data = data_url("video/mp4", video.read_bytes())
     page = files("gshell_mi.report") / "page"
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
                                      lstrip_blocks=True)
@@ -79,31 +82,16 @@ def _write(folder: Path, metrics: dict, config: ReportConfig) -> Path:
     library = (page / "model-viewer.min.js").read_text(encoding="utf-8").rpartition("//# sourceMappingURL")[0]
     text = template.render(
         name=Path(metrics["scene"]).stem, generator=TAG, metrics=metrics, turntable=video_data,
-        model=_data_url("model/gltf-binary", viewer_model(folder)), library=Markup(library),
-        triptychs=_triptychs(folder / "views", config.views, metrics),
+        model=data_url("model/gltf-binary", viewer_model(folder)), library=Markup(library),
+        headings=HEADINGS, training=training_pictures(folder, config.views, metrics),
+        training_rows=score_rows(metrics["training"]), held_out=held_out_pictures(folder, metrics),
+        held_out_rows=score_rows(metrics["held_out"]) if "held_out" in metrics else [],
+        masks=mask_pictures(folder, metrics), colors=_COLORS,
         curves=[Markup(drawing) for drawing in curves(folder / "log.jsonl")],
-        probe=_image_url(_probe(folder / "light.exr")))
+        probe=image_url(_probe(folder / "light.exr")))
     with replacing(folder / "report.html") as partial:
         partial.write_text(text, encoding="utf-8")
     return folder / "report.html"
-
-
-def _triptychs(folder: Path, count: int, metrics: dict) -> list[dict]:
-    """Target, fit and error of up to ``count`` views, as data URLs."""
-    paths = sorted(folder.glob("*.png"))
-    chosen = np.unique(np.linspace(0, len(paths) - 1, count).round().astype(int)) if paths else []
-    shown = []
-    for path in (paths[i] for i in chosen):
-        try:
-            pixels = np.asarray(Image.open(path).convert("RGB"))
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            raise UserError(f"'{path}' cannot be read as an image; remove it, or run the fit "
-                            f"again.") from error
-        width = pixels.shape[1] // 3
-        target, fit, error = (_image_url(pixels[:, i * width:(i + 1) * width]) for i in range(3))
-        shown.append({"name": path.stem, "target": target, "fit": fit, "error": error,
-                      "psnr": metrics["psnr_per_view"].get(path.stem)})
-    return shown
 
 
 def _probe(path: Path) -> np.ndarray:
@@ -125,13 +113,3 @@ def _probe(path: Path) -> np.ndarray:
     pictures = [srgb(exposure * radiance[rows][:, columns])]
     pictures += [srgb(exposure * ball[..., :3] + 1 - ball[..., 3:]) for ball in balls]
     return (np.concatenate(pictures, axis=1) * 255 + 0.5).astype(np.uint8)
-
-
-def _image_url(pixels: np.ndarray) -> str:
-    stream = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "WEBP", quality=90)
-    return _data_url("image/webp", stream.getvalue())
-
-
-def _data_url(kind: str, data: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

@@ -20,7 +20,9 @@ def _finished(folder: Path) -> None:
 
     write_fit(folder, open_sphere(2), views=2, size=8)
     (folder / "metrics.json").write_text(json.dumps({
-        "scene": "a.xml", "targets": "targets", "psnr_training": 30.0, "psnr_per_view": {"view_000": 30.0},
+        "scene": "a.xml", "targets": "targets", "psnr_training": 30.0,
+        "training": {"views": {"view_000": {"psnr": 30.0}}, "mean": {"psnr": 30.0}},
+        "held_out": {"views": {"view_001": {"psnr": 20.0, "mask_iou": 0.9}}, "mean": {"psnr": 20.0}},
         "versions": {}, "config": {}, "seconds": {"total": 1.0}, "warnings": ["one"],
         "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1}}), encoding="utf-8")
 
@@ -55,6 +57,9 @@ def write_reported_fit(folder: Path) -> None:
     for number in range(2):
         Image.fromarray(np.zeros((8, 24, 3), np.uint8)).save(
             folder / "out" / "views" / f"view_{number:03}.png")
+    for name, width in (("held_out", 24), ("masks", 8)):
+        (folder / "out" / name).mkdir()
+        Image.fromarray(np.zeros((8, width, 3), np.uint8)).save(folder / "out" / name / "view_001.png")
 
 
 def film(folder: Path) -> None:

@@ -65,6 +65,16 @@ def test_files_and_folders(sphere, tmp_path):
         np.mean([view["psnr"] for view in whole["views"].values()]))
 
 
+def test_images_that_show_the_object_nowhere_alike(tmp_path, capsys):
+    for name, half in (("a.exr", slice(8)), ("b.exr", slice(8, 16))):
+        pixels = np.zeros((16, 16, 4), np.float32)
+        pixels[half] = 1
+        mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGBA).write(str(tmp_path / name))
+    found = scores(tmp_path / "a.exr", tmp_path / "b.exr", tmp_path=tmp_path)
+    assert found["mean"]["psnr_inside"] is None and found["mean"]["mask_iou"] == 0
+    assert "–" in capsys.readouterr().out
+
+
 def test_meshes(sphere, tmp_path):
     found = scores(sphere.folder / "mesh.ply", sphere.folder / "template.ply", tmp_path=tmp_path)
     assert found["mesh"]["f_score"] == 1

@@ -1,13 +1,16 @@
 """Scores against closed forms and independent computations."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
 
 from gshell_mi import UserError
-from gshell_mi.evaluation import albedo_scale, image_scores, mesh_scores
+from gshell_mi.evaluation import VIEW_SCORES, albedo_scale, image_scores, mesh_scores, view_scores
 from gshell_mi.evaluation.mesh_scores import winding_numbers
 from gshell_mi.images import srgb
+from gshell_mi.targets import Target
 
 
 def flat(color, alpha=1.0, size=16) -> np.ndarray:
@@ -32,6 +35,41 @@ def test_mask_iou():
     image[:8, :, 3], reference[4:12, :, 3] = 1, 1
     assert image_scores(image, reference)[0]["mask_iou"] == pytest.approx(4 / 12)
     assert image_scores(flat([0, 0, 0], 0.0), flat([0, 0, 0], 0.0))[0]["mask_iou"] == 1
+
+
+def test_psnr_inside_is_of_what_both_show():
+    image, reference = flat([0.2, 0.2, 0.2]), flat([0.4, 0.4, 0.4])
+    image[:8], reference[4:12] = 0, 0
+    step = srgb(np.array(0.4)) - srgb(np.array(0.2))
+    scores = image_scores(image, reference)[0]
+    assert scores["psnr_inside"] == pytest.approx(-20 * np.log10(step), abs=1e-3)
+    assert scores["psnr"] < scores["psnr_inside"], "white instead of grey is worse than another grey"
+    image[12:] = 0
+    assert image_scores(image, reference)[0]["psnr_inside"] is None
+
+
+def test_scores_of_a_view_are_those_of_its_images():
+    rng = np.random.default_rng(2)
+    image, reference = (rng.random((16, 24, 4)).astype(np.float32) for _ in range(2))
+    found = view_scores(image, Target(Path("a.exr"), reference, True))
+    whole, _ = image_scores(image, reference)
+    assert found == {name: whole[name] for name in VIEW_SCORES}
+
+
+def test_what_a_target_does_not_tell_is_not_held_against_a_view():
+    reference, image = flat([0.4, 0.4, 0.4]), flat([0.4, 0.4, 0.4])
+    image[:, :8] = 0
+    known = np.ones((16, 16), np.float32)
+    assert view_scores(image, Target(Path("a.exr"), reference, True, known=known))["mask_iou"] == 0.5
+    known[:, :8] = 0
+    found = view_scores(image, Target(Path("a.exr"), reference, True, known=known))
+    assert (found["psnr"], found["mask_iou"], found["ssim"], found["flip"]) == (120, 1, 1, 0)
+
+
+def test_scores_that_a_view_does_not_have():
+    black = flat([0, 0, 0], size=5)
+    found = view_scores(black, Target(Path("a.exr"), black, has_alpha=False))
+    assert found == {"psnr": 120, "psnr_inside": 120, "ssim": None, "flip": 0, "mask_iou": None}
 
 
 def test_noise_lowers_every_score():

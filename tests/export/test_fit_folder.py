@@ -1,6 +1,7 @@
 """What a fit leaves behind, as other programs read it."""
 
 import json
+import shutil
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -13,30 +14,33 @@ from PIL import Image
 from topology import loop_count
 
 from gshell_mi import UserError
-from gshell_mi.export import export_fit, write_metrics
+from gshell_mi.evaluation import VIEW_SCORES
+from gshell_mi.export import export_fit, fit_folder, write_metrics
 from gshell_mi.export.ply import read_ply, write_ply
 from gshell_mi.export.stock_scene import up_axis, write_light, write_scene
 from gshell_mi.fields import LatticeFields, sphere
 from gshell_mi.fit.config import FitConfig
 from gshell_mi.fit.joint.config import RenderConfig
 from gshell_mi.fit.joint.joint import JointStage
+from gshell_mi.images import BOTH, FIT_ONLY, MASK_ONLY, psnr
 from gshell_mi.lattice import TetLattice
-from gshell_mi.light import EnvironmentLight
+from gshell_mi.light import EnvironmentLight, turns_with_camera
 from gshell_mi.material import MaterialField
 from gshell_mi.own_folder import MARK, OwnFolder
 from gshell_mi.scene import load_fit_scene
 
 LATTICE = TetLattice(16)
 
-#: Five of the twelve views, spread evenly.
-SHOWN = [f"view_{i:03}" for i in (0, 3, 6, 8, 11)]
+#: Every sixth view, and five of the others, spread evenly.
+HELD_OUT = ["view_000", "view_006"]
+SHOWN = [f"view_{i:03}" for i in (1, 3, 5, 9, 11)]
 
 
 @pytest.fixture(scope="module")
 def exported(bowl_scene, tmp_path_factory):
     """The folder, the stage and the metrics of a sphere cut open at the top, in many colours."""
     output = tmp_path_factory.mktemp("exported")
-    fit = load_fit_scene(bowl_scene)
+    fit = load_fit_scene(bowl_scene, hold_out=6)
     ball = sphere(LATTICE, 0.6)
     position = LATTICE.vertex_positions()
     fit.subject.set_fields(LatticeFields(ball.sdf, 0.3 - position[:, 1], ball.deform))
@@ -119,9 +123,10 @@ def test_scene_is_the_fitted_one(exported):
     """Stock Mitsuba sees from the first view what the fit's own scene shows there."""
     scene = mi.load_file(str(exported.output / "scene.xml"))
     assert [shape.class_name() for shape in scene.shapes()] == ["PLYMesh"]
-    assert [sensor.id() for sensor in scene.sensors()] == [f"view_{i:03}" for i in range(VIEWS)]
+    assert [sensor.id() for sensor in scene.sensors()] == [
+        name for i in range(VIEWS) if (name := f"view_{i:03}") not in HELD_OUT]
     sensor, first = scene.sensors()[0], exported.fit.sensors[0]
-    assert sensor.id() == first.id() == "view_000"
+    assert sensor.id() == first.id() == "view_001"
     film = mi.Point2f([0.1, 0.5, 0.9], [0.3, 0.5, 0.8])
     ours, theirs = (s.sample_ray(0, 0.5, film, mi.Point2f(0.5))[0] for s in (sensor, first))
     np.testing.assert_allclose(np.array(ours.o), np.array(theirs.o), atol=1e-5)
@@ -208,7 +213,15 @@ def test_the_mark_lists_what_was_written(exported):
     found = OwnFolder(exported.output, "fit")
     there = {path.relative_to(exported.output).as_posix() for path in exported.output.rglob("*")
              if path.is_file()}
-    assert found.files == there - {MARK} >= {"mesh.ply", "scene.xml", "metrics.json", "views/view_000.png"}
+    assert found.files == there - {MARK} >= {"mesh.ply", "scene.xml", "metrics.json", "views/view_001.png"}
+
+
+def test_pictures_go_with_the_fit(exported, tmp_path):
+    """All are files of the fit's, so another fit that has none of them removes them."""
+    shutil.copytree(exported.output, tmp_path / "out")
+    (tmp_path / "out" / "held_out" / "mine.txt").write_text("mine")
+    OwnFolder(tmp_path / "out", "fit").clear()
+    assert sorted(path.name for path in (tmp_path / "out").rglob("*")) == [MARK, "held_out", "mine.txt"]
 
 
 def test_what_is_in_the_way_of_an_export_stays(exported, tmp_path):
@@ -221,8 +234,43 @@ def test_what_is_in_the_way_of_an_export_stays(exported, tmp_path):
 def test_views(exported):
     names = {path.name for path in (exported.output / "views").iterdir()}
     assert names == {f"{name}.png" for name in SHOWN}
-    image = np.array(Image.open(exported.output / "views" / "view_000.png"))
-    assert image.shape == (SIZE, 3 * SIZE, 3)
+    assert {path.stem for path in (exported.output / "held_out").iterdir()} == set(HELD_OUT)
+    assert {path.stem for path in (exported.output / "masks").iterdir()} == {*SHOWN, *HELD_OUT}
+    for name in ("views/view_001.png", "held_out/view_000.png"):
+        assert np.array(Image.open(exported.output / name)).shape == (SIZE, 3 * SIZE, 3)
+
+
+@pytest.mark.parametrize(("entry", "names"), [("training", SHOWN), ("held_out", HELD_OUT)])
+def test_scores_are_those_of_the_pictures(exported, entry, names):
+    scores = exported.metrics[entry]
+    assert list(scores["views"]) == names
+    folder = exported.output / ("views" if entry == "training" else entry)
+    for name, found in scores["views"].items():
+        assert set(found) == set(VIEW_SCORES)
+        target, shown, _ = np.split(np.array(Image.open(folder / f"{name}.png")) / 255, 3, axis=1)
+        assert found["psnr"] == pytest.approx(psnr(shown, target), abs=0.1)
+        overlay = np.array(Image.open(exported.output / "masks" / f"{name}.png")) / 255
+        both, *others = (np.isclose(overlay, color, atol=1 / 255).all(-1).sum()
+                         for color in (BOTH, MASK_ONLY, FIT_ONLY))
+        assert found["mask_iou"] == pytest.approx(both / (both + sum(others)), abs=1e-4)
+    for score in VIEW_SCORES:
+        mean = np.mean([found[score] for found in scores["views"].values()])
+        assert scores["mean"][score] == pytest.approx(mean, abs=1e-4)
+
+
+def test_the_light_turns_with_held_out_cameras_too(exported, tmp_path, monkeypatch):
+    """As seen from the first training view."""
+    given = {}
+    monkeypatch.setattr(fit_folder, "write_views", lambda output, folder, views, lights: given.update(
+        {view.sensor.id(): np.array(light.matrix) for view, light in zip(views, lights, strict=True)})
+        or {"views": {}, "mean": {"psnr": 0.0}})
+    export_fit(tmp_path, exported.fit, exported.joint.material, exported.joint.light, 20, light_turns=True)
+    first = exported.fit.sensors[0]
+    assert len(given) == VIEWS
+    for view in (*exported.fit.training, *exported.fit.held_out):
+        (_, turn) = turns_with_camera([first, view.sensor])
+        expected = np.array(exported.joint.light.turned(turn).matrix)
+        np.testing.assert_allclose(given[view.sensor.id()], expected, atol=1e-6)
 
 
 def test_metrics(exported, mesh):
@@ -232,7 +280,7 @@ def test_metrics(exported, mesh):
     assert (counts["vertices"], counts["faces"]) == (len(mesh.vertices), len(mesh.faces))
     assert (counts["boundary_loops"], counts["components"], counts["nonmanifold_edges"]) == (1, 1, 0)
     assert stored["seconds"] == {"hull": 1.5, "joint": 2.0, "total": 3.5}
-    assert list(stored["psnr_per_view"]) == SHOWN
+    assert stored["psnr_training"] == stored["training"]["mean"]["psnr"]
     assert stored["variant"] == mi.variant()
 
 

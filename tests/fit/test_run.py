@@ -86,7 +86,7 @@ def test_metrics(whole):
     assert metrics["counts"]["faces"] == len(found.faces)
     assert metrics["counts"]["boundary_loops"] == 1
     assert metrics["counts"]["nonmanifold_edges"] == 0
-    per_view = list(metrics["psnr_per_view"].values())
+    per_view = [scores["psnr"] for scores in metrics["training"]["views"].values()]
     assert metrics["psnr_training"] == pytest.approx(np.mean(per_view), abs=1e-2)
     assert metrics["psnr_training"] > 15
     assert metrics["config"]["openings"]["iterations"] == 100 and metrics["config"]["seed"] == 0
@@ -248,6 +248,32 @@ def test_overwriting_keeps_the_earlier_fit_until_the_new_one_is_there(bowl_scene
     assert (output / "views" / "holiday.jpg").read_text() == "mine" and not list(output.glob(".*"))
     assert {path.relative_to(output) for path in output.rglob("*.*")} == {
         path.relative_to(output) for path in before}
+
+
+def test_no_stage_sees_what_is_held_out(bowl_scene, tmp_path, capfd):
+    """Targets that show nothing would leave nothing of the hull."""
+    shutil.copytree(bowl_scene.parent, tmp_path / "in")
+    scene, output = tmp_path / "in" / bowl_scene.name, tmp_path / "out"
+    held_out = ["view_000", "view_005", "view_010"]
+    for name in held_out:
+        path = scene.with_suffix("") / f"{name}.exr"
+        mi.Bitmap(np.zeros((SIZE, SIZE, 4), np.float32), mi.Bitmap.PixelFormat.RGBA).write(str(path))
+    options = (*CLOSED, "--iterations", "1")
+    assert fit(scene, output, *options, "--hold-out", "5") == 0
+    metrics = json.loads((output / "metrics.json").read_text())
+    scores = metrics["held_out"]
+    assert list(scores["views"]) == held_out and len(metrics["training"]["views"]) == VIEWS - 3
+    assert metrics["training"]["mean"]["mask_iou"] > 0.7
+    assert scores["mean"]["mask_iou"] == 0 and scores["mean"]["psnr_inside"] is None
+    last = capfd.readouterr().out.splitlines()[-1]
+    assert last.startswith(f"held-out views: {scores['mean']['psnr']:.2f} dB, SSIM") and "IoU 0.000" in last
+    # Another fit without any takes their pictures away.
+    assert {path.stem for path in (output / "held_out").iterdir()} == set(held_out)
+    for name in held_out:
+        shutil.copy(bowl_scene.with_suffix("") / f"{name}.exr", scene.with_suffix("") / f"{name}.exr")
+    assert fit(scene, output, *options, "--overwrite") == 0
+    assert not (output / "held_out").exists()
+    assert {path.stem for path in (output / "masks").iterdir()} == {f"view_{i:03}" for i in range(VIEWS)}
 
 
 def test_a_volume_is_judged(bowl_scene, tmp_path):

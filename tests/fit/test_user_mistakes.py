@@ -407,6 +407,15 @@ def test_interrupt_says_how_to_go_on(scene, stopped, capfd):
     assert not list(stopped.glob(".*"))
 
 
+def test_all_views_held_out(told):
+    assert "--hold-out 1 leaves 0 of the 12 views" in told("--hold-out", "1")
+
+
+def test_resume_with_other_views_held_out(told, stopped):
+    assert "was made with hold_out = 0, not 4; resume with the same settings" in told("--resume",
+                                                                                      "--hold-out", "4")
+
+
 def test_resume_with_other_settings(told, stopped):
     assert "was made with render.max_depth = 2, not 3" in told("--resume", "--render.max-depth", "3")
 
@@ -490,7 +499,7 @@ def test_disk_full_at_a_checkpoint(told, stopped, monkeypatch):
     assert not list(stopped.glob(".*")), "no remains"
 
 
-@pytest.mark.parametrize("writer", ["_write_surface", "_write_views"])
+@pytest.mark.parametrize("writer", ["_write_surface", "write_views"])
 def test_disk_full_at_export(told, scene, tmp_path, monkeypatch, writer):
     output = tmp_path / "out"
     with monkeypatch.context() as patch:

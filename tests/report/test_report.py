@@ -1,5 +1,6 @@
 """report.html: what is in it, and that it works in a browser without a network."""
 
+import base64
 import io
 import json
 import re
@@ -27,18 +28,34 @@ SMALL = ReportConfig(turntable_frames=3, turntable_size=64, turntable_spp=2, vie
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 
 
+TRAINING = {"views": {"view_000": {"psnr": 31.5, "psnr_inside": 30.0, "ssim": 0.95, "flip": 0.04,
+                                   "mask_iou": 0.98},
+                      "view_001": {"psnr": 31.0, "mask_iou": None}},
+            "mean": {"psnr": 31.25, "psnr_inside": 30.0, "ssim": 0.95, "flip": 0.04, "mask_iou": 0.98}}
+HELD_OUT = {"views": {"view_003": {"psnr": 29.0, "mask_iou": 0.81}, "view_004": {"psnr": 28.0,
+                                                                                 "mask_iou": 0.92}},
+            "mean": {"psnr": 28.5, "mask_iou": 0.865}}
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A finished fit's folder: three views whose targets are red and whose fits are blue."""
+    """A finished fit's folder: three views whose targets are red and whose fits are blue; two held out."""
     folder = write_fit(tmp_path_factory.mktemp("fit"), open_sphere(3))
     (folder / "views").mkdir()
     triptych = np.zeros((32, 96, 3), np.uint8)
     triptych[:, :32, 0], triptych[:, 32:64, 2] = 255, 255
     for number in range(3):
         Image.fromarray(triptych).save(folder / "views" / f"view_{number:03}.png")
+    overlay = np.full((500, 500, 3), 255, np.uint8)
+    overlay[100:400, 200:300] = 128
+    for name in ("held_out", "masks"):
+        (folder / name).mkdir()
+        for number in (3, 4):
+            image = Image.fromarray(triptych if name == "held_out" else overlay)
+            image.save(folder / name / f"view_{number:03}.png")
     mesh = open_sphere(3)
     (folder / "metrics.json").write_text(json.dumps({
-        "scene": "ball <&>.xml", "psnr_training": 31.25, "psnr_per_view": {"view_000": 31.5},
+        "scene": "ball <&>.xml", "psnr_training": 31.25, "training": TRAINING, "held_out": HELD_OUT,
         "counts": asdict(topology(mesh.vertices, mesh.faces)), "seconds": {"hull": 1.0, "total": 1.0},
         "versions": {"gshell_mi": "0"}, "warnings": ["1 floater <here>"], "diagnostics": {"floaters": 1},
         "peak_memory_mib": 900, "variant": "llvm_ad_rgb", "config": asdict(FitConfig())}))
@@ -61,7 +78,40 @@ def test_page_is_self_contained(folder):
     assert "daylight_votes" in text and "seconds.hull" in text
 
 
-METRICS = {"scene": "a.xml", "psnr_training": 30.0, "psnr_per_view": {"view_000": 30.0}, "versions": {},
+def test_held_out_views_come_worst_first(folder):
+    page = (folder / "report.html").read_text().partition('<script type="module">')[0]
+    assert "28.50 dB on 2 held-out views" in page
+    held_out, training = page.partition("<h2>Held-out views</h2>")[2].split("<h2>Training views</h2>")
+    rows = re.findall(r"<td>(view_\d+|mean)</td><td>([^<]*)</td><td>([^<]*)</td>", held_out)
+    assert rows == [("mean", "28.50", "–"), ("view_004", "28.00", "–"), ("view_003", "29.00", "–")]
+    told = re.findall(r"<figcaption>(.*)</figcaption>", held_out)
+    assert told == ["view_004, 28.00 dB", "view_003, 29.00 dB"]
+    rows = re.findall(r"<td>(view_\d+|mean)</td><td>([^<]*)</td><td>([^<]*)</td>", training)
+    assert rows == [("mean", "31.25", "30.00"), ("view_001", "31.00", "–"), ("view_000", "31.50", "30.00")]
+
+
+def test_masks_come_worst_first_and_small(folder):
+    page = (folder / "report.html").read_text().partition('<script type="module">')[0]
+    masks = page.partition("<h2>Masks</h2>")[2].partition("<h2>Curves</h2>")[0]
+    told = re.findall(r"<figcaption>(.*)</figcaption>", masks)
+    assert told == ["view_003 (held out), IoU 0.810", "view_004 (held out), IoU 0.920"]
+    data = re.search(r"data:image/webp;base64,([^\"]*)", masks)[1]
+    picture = Image.open(io.BytesIO(base64.b64decode(data)))
+    assert picture.size == (round(320 / 320 * 120), 320), "cut to what is not white, with 10 pixels around"
+
+
+def test_a_fit_to_all_views(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "fit")
+    for name in ("held_out", "masks"):
+        shutil.rmtree(tmp_path / "fit" / name)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    del metrics["held_out"]
+    (tmp_path / "fit" / "metrics.json").write_text(json.dumps(metrics))
+    page = write_report(tmp_path / "fit", SMALL).read_text().partition('<script type="module">')[0]
+    assert "<h2>Training views</h2>" in page and "eld-out" not in page and "<h2>Masks</h2>" not in page
+
+
+METRICS = {"scene": "a.xml", "psnr_training": 30.0, "training": TRAINING, "versions": {},
            "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1},
            "seconds": {"total": 1.0}, "config": {}}
 
@@ -80,7 +130,11 @@ def test_metrics_of_a_fit_are_read(tmp_path):
         ({"psnr_training": float("nan")}, "'psnr_training' is no number"),
         ({"psnr_training": 10**400}, "'psnr_training' is no number"),
         ({"counts": [3]}, "'counts' is no dict"), ({"counts": {"vertices": 3}}, "'counts.faces' is no"),
-        ({"seconds": {}}, "'seconds.total' is no"), ({"psnr_per_view": {"a": None}}, "'psnr_per_view' holds"),
+        ({"seconds": {}}, "'seconds.total' is no"), ({"training": {}}, "'training' holds"),
+        ({"training": TRAINING | {"mean": 5}}, "'training' holds"),
+        ({"held_out": 5}, "'held_out' is no dict"),
+        ({"held_out": {"views": {"a": {"psnr": None}}, "mean": {"psnr": 1}}}, "'held_out' holds"),
+        ({"held_out": {"views": {"a": {"psnr": 1, "ssim": "x"}}, "mean": {"psnr": 1}}}, "'held_out' holds"),
         ({"warnings": "x"}, "'warnings' is no list"), ({"diagnostics": 1}, "'diagnostics' is no"),
         ({"config": {"a": [[[[[[[[1]]]]]]]]}}, "it is nested too deeply"))),
 ])
@@ -104,6 +158,8 @@ def test_metrics_that_are_no_json(tmp_path, text):
 @pytest.mark.parametrize(("name", "words"), [
     ("mesh.glb", "mesh.glb' is damaged"),
     ("views/view_000.png", "view_000.png' cannot be read as an image"),
+    ("held_out/view_003.png", "view_003.png' cannot be read as an image"),
+    ("masks/view_003.png", "view_003.png' cannot be read as an image"),
     ("light.exr", "light.exr"), ("mesh.ply", "mesh.ply")])
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: b"garbage", lambda data: data[:30]])
 def test_damaged_files_of_a_fit(folder, tmp_path, capsys, name, words, damage):
@@ -112,6 +168,14 @@ def test_damaged_files_of_a_fit(folder, tmp_path, capsys, name, words, damage):
     assert main([str(tmp_path / "fit"), "--turntable-frames", "1", "--turntable-size", "16"]) == 2
     error = capsys.readouterr().err
     assert words in error and error.startswith("error: ") and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["views/view_000.png", "held_out/view_003.png"])
+def test_a_picture_that_is_no_triptych(folder, tmp_path, name):
+    shutil.copytree(folder, tmp_path / "fit")
+    Image.new("RGB", (2, 9)).save(tmp_path / "fit" / name)
+    with pytest.raises(UserError, match="is too narrow for three pictures"):
+        write_report(tmp_path / "fit", ReportConfig(turntable_frames=1, turntable_size=16, turntable_spp=1))
 
 
 def test_a_report_of_somebody_elses_is_kept(folder, tmp_path):

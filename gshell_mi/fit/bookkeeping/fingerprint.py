@@ -31,6 +31,7 @@ def fingerprint(scene: FitScene, lattice: Lattice) -> dict[str, Any]:
     subject = scene.subject
     others = [shape for shape in scene.scene.shapes() if shape is not subject]
     fields = subject.fields() if subject.filename else None
+    views = {view.sensor.id(): view for view in (*scene.training, *scene.held_out)}
     return {
         "lattice": f"{lattice.grid}, {lattice.resolution} cells",
         "box": _digest(np.array(subject.to_world.matrix)),
@@ -38,9 +39,10 @@ def fingerprint(scene: FitScene, lattice: Lattice) -> dict[str, Any]:
         "material": _of_parameters(scene.bsdf),
         "light": _of_parameters(scene.light),
         "objects": _digest(*map(_of_parameters, others)),
-        "views": {sensor.id(): _of_parameters(sensor, sensor.film().rfilter()) for sensor in scene.sensors},
-        "targets": {sensor.id(): _digest(target.rgba, *([] if target.depth is None else [target.depth]))
-                    for sensor, target in zip(scene.sensors, scene.targets, strict=True)},
+        "views": {name: _of_parameters(view.sensor, view.sensor.film().rfilter())
+                  for name, view in views.items()},
+        "targets": {name: _digest(view.target.rgba, *([] if view.target.depth is None else
+                                                      [view.target.depth])) for name, view in views.items()},
     }
 
 
