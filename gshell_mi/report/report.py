@@ -20,6 +20,7 @@ from ..errors import UserError
 from ..export.asset import write_asset
 from ..files import replacing
 from ..images import srgb
+from ..integer_images import open_image
 from ..own_folder import TAG, own_folder
 from ..turntable import TurntableConfig, render_turntable, write_video
 from ..wording import counted
@@ -95,7 +96,7 @@ def _triptychs(folder: Path, count: int, metrics: dict) -> list[dict]:
     shown = []
     for path in (paths[i] for i in chosen):
         try:
-            pixels = np.asarray(Image.open(path).convert("RGB"))
+            pixels = np.asarray(open_image(path).convert("RGB"))
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             raise UserError(f"'{path}' cannot be read as an image; remove it, or run the fit "
                             f"again.") from error
