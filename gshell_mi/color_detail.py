@@ -75,7 +75,7 @@ class ColorDetail:
         old, count = self._lookup, self.bricks.voxel_count
         self._use(_bricks_around(vertices, self.bricks.side))
         place = mi.Vector3i((self.bricks.centres() + 1) * (0.5 * mi.Float(old.side)))
-        voxel = old.voxel(*place, mi.Bool(True))
+        voxel = old.voxel(place.x, place.y, place.z, mi.Bool(True))
         source = mi.UInt32(dr.select(voxel < 0, dr.opaque(mi.Int32, count), voxel))
         self.values = moved(self.values, source)
         return source

@@ -159,8 +159,8 @@ class JointStage:
             self._step_material(progress, diffuse)
             self._step_light(progress)
         self._follow_surface(rescan=(iteration + 1) % _RESCAN == 0)
-        error = sum(mean(dr.square(dr.detach(image)[..., :3] - self._targets[view][..., :3]))
-                    for view, image in zip(views, images, strict=True)) / len(views)
+        error = mi.Float(sum(mean(dr.square(dr.detach(image)[..., :3] - self._targets[view][..., :3]))
+                             for view, image in zip(views, images, strict=True)) / len(views))
         return {"loss": total[0], "image": color[0], "mask": mask[0],
                 **{name: value[0] for name, value in terms.items()},
                 "psnr": decibels(error[0])}
@@ -208,7 +208,7 @@ class JointStage:
 
     def _render(self, view: int, seed: int) -> mi.TensorXf:
         config = self.config.render
-        if self._turns:
+        if self.light and self._turns:
             self.parameters["light.to_world"] = self.light.turned(self._turns[view])
             self.parameters.update()
         with phase("render") as compute:
@@ -250,7 +250,7 @@ class JointStage:
     def _follow_surface(self, *, rescan: bool) -> None:
         """Moves the blocks that the fields are stored in, and all that is stored with them."""
         if self.detail and rescan:
-            self._follow_detail()
+            self._follow_detail(self.detail)
         carried = self.subject.follow(rescan=rescan)
         if carried is None:
             return
@@ -270,6 +270,7 @@ class JointStage:
 
     def restore_detail(self, arrays: Mapping[str, np.ndarray]) -> None:
         """The detail that a stage before has left."""
+        assert self.detail is not None, "that stage had one"
         self.detail.restore(arrays)
         self.detail_optimizer["detail"] = self.detail.values
 
@@ -278,12 +279,12 @@ class JointStage:
         vertices = mi.Point3f(dr.detach(self.subject.surface.vertices))
         return (mi.Transform4f(self.subject.to_world).inverse() @ vertices).numpy().T
 
-    def _follow_detail(self) -> None:
+    def _follow_detail(self, detail: ColorDetail) -> None:
         """Moves the detail's voxels, and what the optimiser keeps for them, to where the surface is now."""
-        self.detail.values = dr.detach(self.detail_optimizer["detail"])
-        source = self.detail.follow(self._local_vertices())
+        detail.values = dr.detach(self.detail_optimizer["detail"])
+        source = detail.follow(self._local_vertices())
         _, promoted, rate, (step, first, second, largest) = self.detail_optimizer.state["detail"]
-        value = self.detail.values
+        value = detail.values
         dr.enable_grad(value)
         self.detail_optimizer.state["detail"] = (
             value, promoted, rate, (step, moved(first, source), moved(second, source), largest))
@@ -311,7 +312,7 @@ class JointStage:
 
     def _step_light(self, progress: float) -> None:
         optimizer = self.light_optimizer
-        if not optimizer.state:
+        if self.light is None or not optimizer.state:
             return
         gradient = finite(dr.grad(optimizer["log_radiance"]))
         dr.set_grad(optimizer["log_radiance"], gradient / self.light.solid_angles)
