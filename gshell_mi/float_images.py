@@ -1,5 +1,5 @@
 """Floating point images from files: OpenEXR in its display window and its layer of colour, Radiance HDR, PFM,
-and those of 8 and 16 bits. None is read by Mitsuba, whose readers trust what a header promises."""
+and those of 8 and 16 bits. Mitsuba's readers, which trust what a file promises, see none of them first."""
 
 from __future__ import annotations
 
