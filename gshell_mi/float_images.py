@@ -1,5 +1,5 @@
-"""Floating point images from files: OpenEXR in its display window and its layer of colour, and what Mitsuba
-reads besides."""
+"""Floating point images from files: OpenEXR in its display window and its layer of colour, Radiance HDR, PFM,
+and those of 8 and 16 bits. Mitsuba's readers, which trust what a file promises, see none of them first."""
 
 from __future__ import annotations
 
@@ -12,10 +12,20 @@ import numpy as np
 import OpenEXR
 
 from .compat import without_chatter
+from .integer_images import integer_image_size, read_integer_image
+from .plain_float_images import (
+    MOST_PIXELS,
+    float_map_size,
+    is_float_map,
+    is_radiance,
+    radiance_size,
+    read_float_map,
+    read_radiance,
+)
 
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
-#: A file whose header promises more pixels is refused before they are made room for.
-MOST_PIXELS = 1 << 28
+#: First bytes of what Mitsuba reads besides: Radiance, PFM, PPM, PNG, JPEG and BMP. TGA it reads unchecked.
+_MITSUBA_KINDS = (b"#?", b"PF", b"Pf", b"P6", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"BM")
 #: Windows and sizes beyond these shares of each other come from damaged headers.
 _MOST_EMPTY, _MOST_PACKED = 100, 1 << 14
 #: What programs call the layer with the picture, if several layers have colours.
@@ -35,7 +45,8 @@ def image_size(path: Path) -> tuple[int, int]:
         ValueError, OSError, RuntimeError: the file is no image; the last line says why.
     """
     if not is_exr(path):
-        return tuple(mi.Bitmap(str(path)).size())
+        kinds = ((is_radiance, radiance_size), (is_float_map, float_map_size))
+        return next((size for is_kind, size in kinds if is_kind(path)), integer_image_size)(path)
     file = _open(path, header_only=True)
     return _size(file.parts[_picture(file, path)[0]].header["displayWindow"])
 
@@ -53,8 +64,13 @@ def read_float_image(path: Path) -> tuple[np.ndarray, str]:
     Raises:
         ValueError, OSError, RuntimeError: the file is no such image; the last line says why.
     """
+    if is_radiance(path):
+        return read_radiance(path), "RGB"
+    if is_float_map(path):
+        pixels = read_float_map(path)
+        return pixels, "RGB" if pixels.shape[2] == 3 else "Y"
     if not is_exr(path):
-        return _read_by_mitsuba(path)
+        return _linear_integers(path)
     file = _open(path, header_only=True)
     number, channels = _picture(file, path)
     display, data = (file.parts[number].header[window] for window in ("displayWindow", "dataWindow"))
@@ -75,6 +91,19 @@ def read_float_image(path: Path) -> tuple[np.ndarray, str]:
     return pixels, "".join(channels)
 
 
+def check_for_mitsuba(path: Path) -> None:
+    """Makes sure that Mitsuba itself can read an image that is not OpenEXR, however it is damaged.
+
+    Raises:
+        ValueError, OSError, SyntaxError: it is damaged, or Mitsuba's reader of its kind trusts every file.
+    """
+    with open(path, "rb") as file:
+        start = file.read(8)
+    if not start.startswith(_MITSUBA_KINDS):
+        raise ValueError("it is of no kind that Mitsuba reads safely")
+    read_float_image(path)
+
+
 def first_not_finite(pixels: np.ndarray) -> tuple[int, int] | None:
     """(column, row) of the first pixel with NaN or infinity; None if all of (h, w, c) are finite."""
     bad = ~np.isfinite(pixels).all(axis=-1)
@@ -84,14 +113,13 @@ def first_not_finite(pixels: np.ndarray) -> tuple[int, int] | None:
     return int(column), int(row)
 
 
-def _read_by_mitsuba(path: Path) -> tuple[np.ndarray, str]:
-    bitmap = mi.Bitmap(str(path))
-    names = {mi.Bitmap.PixelFormat.Y: "Y", mi.Bitmap.PixelFormat.YA: "YA", mi.Bitmap.PixelFormat.RGB: "RGB",
-             mi.Bitmap.PixelFormat.RGBA: "RGBA"}
-    if bitmap.pixel_format() not in names:
-        raise ValueError(f"it has the channels {bitmap.pixel_format()}")
-    pixels = np.array(bitmap.convert(bitmap.pixel_format(), mi.Struct.Type.Float32, False))
-    return pixels.reshape(*pixels.shape[:2], -1), names[bitmap.pixel_format()]
+def _linear_integers(path: Path) -> tuple[np.ndarray, str]:
+    pixels = read_integer_image(path)
+    bitmap = mi.Bitmap(pixels.reshape(*pixels.shape[:2], -1))
+    bitmap.set_srgb_gamma(True)
+    linear = np.array(bitmap.convert(bitmap.pixel_format(), mi.Struct.Type.Float32, False))
+    linear = linear.reshape(*pixels.shape[:2], -1)
+    return linear, ("Y", "YA", "RGB", "RGBA")[linear.shape[2] - 1]
 
 
 def _open(path: Path, *, header_only: bool) -> OpenEXR.File:

@@ -76,7 +76,7 @@ class Progress:
             last = now
             done += 1
             detail = f"{done}/{total}"
-            if len(durations) > 1:
+            if total is not None and len(durations) > 1:
                 step = usual_duration(durations)
                 detail += f"  {step:.2f} s/step  {_clock((total - done) * step)} left"
             if values and "loss" in values:

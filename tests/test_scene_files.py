@@ -11,6 +11,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import trimesh
+from PIL import Image
 
 from gshell_mi.errors import UserError
 from gshell_mi.scene_files import is_scene_file, load_scene
@@ -110,6 +111,43 @@ def test_an_image_that_would_crash_mitsuba_is_refused(tmp_path):
     path = scene(tmp_path, '<emitter type="envmap"><string name="filename" value="light.exr"/></emitter>')
     with pytest.raises(UserError, match=r"light.exr' has a data window other than its display window"):
         load_scene(path)
+
+
+#: A row that is not packed behind one that is: Mitsuba writes past the end of its memory.
+_OVERFLOWING = (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n\2\2\0\10" + b"\x88\x80" * 4
+                + b"\x90\x10" * 40)
+
+
+@pytest.mark.parametrize("around", [
+    '<emitter type="envmap">{}</emitter>',
+    '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{}</texture></bsdf>',
+])
+@pytest.mark.parametrize("name, content", [
+    ("a.hdr", _OVERFLOWING), ("a.png", _OVERFLOWING),
+    ("a.pfm", b"PF\n65536 65536\n-1.0\n" + bytes(48)),
+    ("a.ppm", b"P6\n65536 65536\n255\n" + bytes(48)),
+    ("a.bmp", b"BM" + bytes(8) + b"\x36\0\0\0\x28\0\0\0\x10\0\0\0\0\0\0\x80\1\0\x18\0" + bytes(40)),
+    # Behind a header of no size comes what makes Mitsuba take it for TGA.
+    ("a.tga", bytes((0, 0, 2)) + bytes(13) + bytes((24, 0)) + bytes(16) + b"TRUEVISION-XFILE.\0"),
+])
+def test_images_that_would_crash_mitsuba_are_refused(around, name, content, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    path = scene(tmp_path, SENSOR + around.format(f'<string name="filename" value="{name}"/>'))
+    with pytest.raises(UserError, match=rf"{name}' cannot be read"):
+        load_scene(path)
+
+
+def test_images_of_other_kinds_are_textures(tmp_path):
+    colors = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
+    for name in ("a.png", "a.jpg", "a.bmp", "a.ppm"):
+        Image.fromarray(colors).save(tmp_path / name)
+    mi.Bitmap(colors.astype(np.float32)).write(str(tmp_path / "a.hdr"))
+    mi.Bitmap(colors.astype(np.float32)).write(str(tmp_path / "a.pfm"))
+    textures = "".join(f'<bsdf type="diffuse" id="{path.suffix[1:]}"> <texture type="bitmap" '
+                       f'name="reflectance"> <string name="filename" value="{path.name}"/> </texture> </bsdf>'
+                       for path in sorted(tmp_path.glob("a.*")))
+    assert textures.count("<texture") == 6
+    assert load_scene(scene(tmp_path, SENSOR + textures)).sensors()
 
 
 @pytest.mark.parametrize("content, words", [

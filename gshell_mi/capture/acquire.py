@@ -11,6 +11,7 @@ from PIL import Image
 
 from ..errors import UserError
 from ..files import replacing
+from ..integer_images import open_image
 from . import video
 from .camera import Camera
 from .config import CaptureConfig
@@ -84,7 +85,7 @@ def _has_alpha(path: Path) -> bool:
     if path.suffix.lower() in FLOAT_SUFFIXES:    # renderings; whether theirs is any good is told later
         return True
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return "A" in image.mode or "transparency" in image.info
     except (OSError, SyntaxError, ValueError):
         return True

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
-from PIL import ExifTags, Image, ImageCms
+from PIL import ExifTags, ImageCms
 
 from .. import float_images
 from ..compat import colour_science
 from ..errors import UserError
+from ..integer_images import integer_image_size, open_image, read_integer_image
 from . import tiff
 
 #: Formats that hold floating point values, linear unless told otherwise, colour premultiplied by alpha.
@@ -50,8 +50,7 @@ def image_size(path: Path) -> tuple[int, int]:
             return float_images.image_size(path)
         if path.suffix.lower() in tiff.SUFFIXES:
             return tiff.tiff_size(path)
-        with Image.open(path) as image:
-            return image.size
+        return integer_image_size(path)
     except Exception as error:
         raise _unreadable(path, error) from error
 
@@ -90,22 +89,7 @@ def _read(path: Path) -> np.ndarray:
         return float_images.read_float_image(path)[0]
     if suffix in tiff.SUFFIXES:
         return tiff.read_tiff(path)
-    with Image.open(path) as image:
-        image.load()    # complains of files that are cut off, unlike libpng through Mitsuba
-        if _is_deep_png(path):
-            return np.array(mi.Bitmap(str(path)))
-        if image.mode in ("P", "PA"):
-            image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
-        elif image.mode not in ("L", "LA", "RGB", "RGBA"):
-            image = image.convert("RGB")
-        return np.array(image)
-
-
-def _is_deep_png(path: Path) -> bool:
-    """Pillow hands out 8 of 16 bits."""
-    with open(path, "rb") as file:
-        header = file.read(25)
-    return header[1:4] == b"PNG" and header[24] == 16
+    return read_integer_image(path)
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
@@ -181,7 +165,7 @@ def color_profile(path: Path) -> str | None:
     if path.suffix.lower() in FLOAT_SUFFIXES:
         return None
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             profile = image.info.get("icc_profile")
         return ImageCms.getProfileDescription(io.BytesIO(profile)).strip() if profile else None
     except (OSError, SyntaxError, ValueError, ImageCms.PyCMSError):
@@ -193,7 +177,7 @@ def exif_orientation(path: Path) -> int:
     if path.suffix.lower() not in _EXIF_SUFFIXES:
         return 1
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return int(image.getexif().get(ExifTags.Base.Orientation, 1))
     except (OSError, SyntaxError, TypeError, ValueError):
         return 1
@@ -204,7 +188,7 @@ def exif_exposure(path: Path) -> float | None:
     if path.suffix.lower() not in _EXIF_SUFFIXES:
         return None
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
         seconds = float(tags[ExifTags.Base.ExposureTime])
         aperture = float(tags[ExifTags.Base.FNumber])

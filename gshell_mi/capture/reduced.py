@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from ..integer_images import open_image
 from .camera import Camera
 from .decoding import exif_orientation, read_pixels
 from .frames import Frame
@@ -36,7 +37,7 @@ def read_reduced(path: Path, longest: int) -> tuple[np.ndarray, int]:
     if longest <= 0 or path.suffix.lower() not in _JPEG or not path.is_file():
         return read_pixels(path), 1
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             before = image.size
             reduction = next((r for r in (8, 4, 2) if max(before) >= r * longest), 1)
             if reduction == 1 or image.mode not in ("L", "RGB"):
@@ -73,7 +74,7 @@ def read_reduced_grey(path: Path, size: tuple[int, int], reduction: int) -> np.n
         to be reduced.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             if reduction == 1 or image.size != size or image.mode not in ("1", "L"):
                 return None
             box = (0, 0, size[0] // reduction * reduction, size[1] // reduction * reduction)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,6 @@ import numpy as np
 from ..compat import write_bitmap
 from ..environment_maps import read_environment_map
 from ..errors import UserError
-from ..float_images import is_exr
 from ..interrupt import check_interrupt
 from ..scene_inputs import scene_inputs
 from ..wording import counted
@@ -246,13 +244,9 @@ class _Import:
         if self.config.light is None:
             return None
         radiance = read_environment_map(self.config.light, "--light")
-        name = "light" + self.config.light.suffix
-        if is_exr(self.config.light):    # whatever its layers and windows are, Mitsuba reads the copy
-            name = "light.exr"
-            write_bitmap(mi.Bitmap(radiance), folder / name)
-        else:
-            shutil.copyfile(self.config.light, folder / name)
-        return f"{self.output.stem}/{name}"
+        # Whatever the given one's kind, layers and windows are, Mitsuba reads this one.
+        write_bitmap(mi.Bitmap(radiance), folder / "light.exr")
+        return f"{self.output.stem}/light.exr"
 
     def _view_record(self, name: str, frame: Frame, clipped: float) -> dict:
         record = {"id": name, "image": str(frame.image), "clipped": round(clipped, 4)}

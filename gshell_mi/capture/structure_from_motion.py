@@ -20,6 +20,7 @@ from PIL import ExifTags, Image
 from ..errors import UserError
 from ..files import replacing
 from ..images import srgb
+from ..integer_images import open_image
 from .decoding import FLOAT_SUFFIXES, image_size, images_in, read_pixels
 from .formats import colmap
 from .frames import Capture, Frame, camera_for_image
@@ -89,7 +90,7 @@ def _focal_35mm(path: Path) -> float | None:
     if path.suffix.lower() in FLOAT_SUFFIXES:
         return None
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return float(image.getexif().get_ifd(ExifTags.IFD.Exif)[_EXIF_FOCAL]) or None
     except (KeyError, OSError, SyntaxError, TypeError, ValueError):
         return None
@@ -119,7 +120,7 @@ def small_copy(path: Path, size: int) -> Image.Image:
     """
     if path.suffix.lower() in (".jpg", ".jpeg"):
         try:
-            with Image.open(path) as image:
+            with open_image(path) as image:
                 wanted = _scaled(image.size, size)
                 image.draft("RGB", wanted)    # decodes no more than is needed
                 return image.convert("RGB").resize(wanted, Image.Resampling.BOX)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
-from ..float_images import MOST_PIXELS
+from ..plain_float_images import MOST_PIXELS
 
 SUFFIXES = (".tif", ".tiff")
 

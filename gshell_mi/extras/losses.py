@@ -77,6 +77,7 @@ def albedo_chroma(step: StepView) -> mi.Float:
 @register_loss("light_smoothness", needs="light")
 def light_smoothness(step: StepView) -> mi.Float:
     """Difference between neighbouring texels of the light's logarithm."""
+    assert step.light is not None, "the loss needs it"
     return losses.light_smoothness(step.light.log_radiance)
 
 
@@ -85,6 +86,7 @@ def _msdf_of(step: StepView, mesh: SurfaceMesh) -> mi.Float:
     if mesh.is_empty:
         return mi.Float([])
     msdf = step.in_cells("msdf")
+    assert mesh.stencil is not None, "it is extracted"
     return dr.detach(mesh.stencil).apply(lambda vertex: gather(mi.Float, msdf, vertex))
 
 

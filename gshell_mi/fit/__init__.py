@@ -1,7 +1,12 @@
 """The fit: from a scene with targets to an open mesh, its material and its light."""
 
+from typing import TYPE_CHECKING
+
 from .bookkeeping.observer import Observer, Preview
 from .config import FitConfig
+
+if TYPE_CHECKING:
+    from .api import FitResult, fit_scene
 
 __all__ = ["FitConfig", "FitResult", "Observer", "Preview", "fit_scene"]
 

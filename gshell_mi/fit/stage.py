@@ -90,9 +90,11 @@ class Work(Protocol):
 
     def step(self, iteration: int) -> Mapping[str, float]:
         """One step; returns what is logged."""
+        ...
 
     def preview(self) -> Preview:
         """The surface as it is."""
+        ...
 
 
 class Stage(Protocol):
@@ -103,3 +105,4 @@ class Stage(Protocol):
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """Makes a better surface of a surface."""
+        ...

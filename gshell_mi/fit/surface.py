@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..fields import LatticeFields
-from ..lattice import GRIDS, Lattice
+from ..lattice import GRIDS, BlockLattice, Lattice
 
 #: Median reflectance that the first split of radiance into material and light assumes.
 TYPICAL_REFLECTANCE = 0.5
@@ -70,7 +70,7 @@ class Surface:
     revision: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
-    def lattice(self) -> Lattice:
+    def lattice(self) -> Lattice | BlockLattice:
         """What the fields live on."""
         return self.fields.lattice
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..fields.thin_parts import back_on_solid
-from ..lattice import Lattice
+from ..lattice import BlockLattice, Lattice
 from ..triangles import positive_part
 from .surface import Surface
 
@@ -57,7 +57,7 @@ class Template:
 
 
 def closed_template(subject: mi.Shape, sdf: np.ndarray,
-                    lattice: Lattice) -> tuple[SurfaceMesh, np.ndarray, np.ndarray]:
+                    lattice: Lattice | BlockLattice) -> tuple[SurfaceMesh, np.ndarray, np.ndarray]:
     """The template that is where ``sdf`` changes sign, its vertices (V, 3) and its faces (F, 3).
 
     Args:

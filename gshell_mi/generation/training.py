@@ -29,6 +29,7 @@ from .data_set import DataSet
 from .model_config import ModelConfig
 from .models import Steering, make_model
 from .own_process import in_own_process
+from .train_config import TrainConfig
 
 if TYPE_CHECKING:
     from .models.block_flow import BlockFlow
@@ -43,32 +44,6 @@ _COOL_DOWN = 0.3
 _EMA = 0.9995
 #: How many samples are drawn as it goes, and with how many steps.
 _DRAWN, _DRAWN_STEPS = 8, 16
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """How a model is trained."""
-
-    model: str = "blocks"
-    """blocks: flow matching on blocks near the surface; unet: the dense reference."""
-    size: str = "S"
-    """XS, S (CPU), M or L (GPU)."""
-    minutes: float = 90.0
-    """How long, all runs of this training together."""
-    steps: int | None = None
-    """Number of steps instead of minutes; the result is then the same on every run."""
-    batch: int = 32
-    """Objects per step and process."""
-    rate: float = 5e-4
-    """Learning rate after the warm-up."""
-    seed: int = 0
-    """Of weights, order and noise."""
-    device: str = "auto"
-    """cpu, cuda, or auto: cuda if there is one."""
-    pictures: int = 4
-    """How often samples are drawn as it goes."""
-    components: int = 128
-    """Of blocks: principal components that each keeps."""
 
 
 def train(data_set: Path, output: Path, config: TrainConfig, *, quiet: bool = True) -> str:

@@ -12,6 +12,7 @@ from PIL import Image
 from ..errors import UserError
 from ..evaluation import Scores
 from ..export.views import HELD_OUT, MASKS, TRAINING
+from ..integer_images import open_image
 from .data_urls import image_url
 
 #: Most held-out views whose pictures are shown, and most overlays of masks: a page has to stay small.
@@ -80,7 +81,7 @@ def _triptych(path: Path) -> np.ndarray:
 
 def _pixels(path: Path) -> np.ndarray:
     try:
-        return np.asarray(Image.open(path).convert("RGB"))
+        return np.asarray(open_image(path).convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise UserError(f"'{path}' cannot be read as an image; remove it, or run the fit again.") from error
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields.smoothing import LatticeDiffusion, MeshDiffusion
-from ..lattice import Lattice
+from ..lattice import BlockLattice, Lattice
 from ..topology import equal_patches, mesh_components
 from ..triangles import vertex_areas
 
@@ -102,7 +102,8 @@ def splat_to_lattice(values: mi.Float, template: SurfaceMesh,
     return LatticeDiffusion(lattice).extend(total, weight)
 
 
-def without_specks(msdf: mi.Float, template: SurfaceMesh, lattice: Lattice, min_area: float) -> mi.Float:
+def without_specks(msdf: mi.Float, template: SurfaceMesh, lattice: Lattice | BlockLattice,
+                   min_area: float) -> mi.Float:
     """ν without the cuts and the islands that are too small to be meant, see ``clean_opacity``."""
     vertices, faces, _ = template.to_numpy()
     msdf = dr.detach(msdf)
@@ -116,7 +117,7 @@ def without_specks(msdf: mi.Float, template: SurfaceMesh, lattice: Lattice, min_
 
 
 def rewritten(msdf: mi.Float, values: np.ndarray, changed: np.ndarray, template: SurfaceMesh,
-              lattice: Lattice) -> mi.Float:
+              lattice: Lattice | BlockLattice) -> mi.Float:
     """ν with new values at the template's vertices that have changed.
 
     Only these are written: on its way over the mesh and back a field loses its details.
@@ -125,12 +126,13 @@ def rewritten(msdf: mi.Float, values: np.ndarray, changed: np.ndarray, template:
     return dr.select(weight > 0, total / dr.maximum(weight, 1e-12), msdf)
 
 
-def _splat(values: mi.Float, template: SurfaceMesh, lattice: Lattice,
+def _splat(values: mi.Float, template: SurfaceMesh, lattice: Lattice | BlockLattice,
            counted: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """Sums, over the counted vertices of the template, of weighted values and of weights."""
     channels = dr.width(values) // template.vertex_count
     total = dr.zeros(mi.Float, channels * lattice.vertex_count)
     weight = dr.zeros(mi.Float, lattice.vertex_count)
+    assert template.stencil is not None, "it is extracted"
     with dr.suspend_grad():
         for vertex, end, share in dr.detach(template.stencil.entries()):
             share = dr.select(dr.gather(mi.Bool, counted, vertex), share, 0)

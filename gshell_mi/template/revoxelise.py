@@ -120,9 +120,9 @@ def _fields(subject: mi.Shape, lattice: Lattice, vertices: np.ndarray, moved: np
     msdf = msdf_from_template(clean_opacity(limited, new_vertices, new_faces, min_area), template, lattice)
     msdf = without_specks(msdf, template, lattice, min_area)
     colour = mi.Float(np.ascontiguousarray(values[:, 1:], np.float32).ravel())
-    radiance, known = splat_to_lattice(colour, template, lattice)
+    seen, known = splat_to_lattice(colour, template, lattice)
     return {"sdf": sdf, "msdf": msdf.numpy(),
-            "radiance": radiance.numpy().reshape(-1, 3), "known": known.numpy()}
+            "radiance": seen.numpy().reshape(-1, 3), "known": known.numpy()}
 
 
 def is_torn(vertices: np.ndarray, faces: np.ndarray, cut_vertices: np.ndarray, cut_faces: np.ndarray,

@@ -185,8 +185,8 @@ def _extract(folder: Path) -> None:
 
 
 def _map(folder: Path) -> None:
-    mi.Bitmap(np.ones((8, 16, 3), np.float32)).write(str(folder / "map.exr"))
-    mi.Bitmap(np.ones((8, 16, 3), np.float32)).write(str(folder / "map.hdr"))
+    for kind in ("exr", "hdr", "pfm"):
+        mi.Bitmap(np.ones((8, 16, 3), np.float32)).write(str(folder / f"map.{kind}"))
 
 
 def _light(folder: Path) -> None:

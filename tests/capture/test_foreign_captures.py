@@ -429,3 +429,21 @@ def test_light_with_infinity_is_refused(nerf, tmp_path):
     with pytest.raises(UserError, match=r"--light .*sun.exr' holds NaN or infinity .*column 5, row 3"):
         import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(light=tmp_path / "sun.exr"))
     assert not (tmp_path / "a.xml").exists() and not (tmp_path / "a").exists()
+
+
+def test_damaged_light_ends_in_a_sentence(nerf, tmp_path, capfd):
+    """A Radiance file that writes past the end of Mitsuba's memory."""
+    (tmp_path / "sun.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n\2\2\0\10"
+                                       + b"\x88\x80" * 4 + b"\x90\x10" * 40)
+    assert main([str(nerf), "-o", str(tmp_path / "a.xml"), "--light", str(tmp_path / "sun.hdr")]) == 2
+    assert "cannot be read as an image (a scanline is damaged)" in " ".join(capfd.readouterr().err.split())
+    assert not (tmp_path / "a.xml").exists()
+
+
+def test_light_is_copied_in_a_kind_that_is_safe(nerf, tmp_path):
+    radiance = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
+    mi.Bitmap(radiance).write(str(tmp_path / "sun.hdr"))
+    import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(light=tmp_path / "sun.hdr"))
+    np.testing.assert_array_equal(np.array(mi.Bitmap(str(tmp_path / "a" / "light.exr"))),
+                                  np.array(mi.Bitmap(str(tmp_path / "sun.hdr"))))
+    assert 'value="a/light.exr"' in (tmp_path / "a.xml").read_text(encoding="utf-8")

@@ -64,7 +64,7 @@ class Checkpoint:
                              "arrays": {name: _kind(array) for name, array in self.arrays.items()}})
         try:
             with replacing(path) as partial, open(partial, "wb") as file:
-                np.savez(file, header=np.array(header), **self.arrays)
+                np.savez(file, header=np.array(header), **dict[str, Any](self.arrays))
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:

@@ -52,7 +52,6 @@ class JointStage:
         material: a ``GivenMaterial`` stays as it is.
         light: None keeps the scene's.
         config: what all stages know.
-        detail_side: voxels per side of the base colour's detail; 0 for none.
         stage: settings of the stage; default: those of the joint stage.
         iterations: its steps; default: those of the joint stage.
     """
@@ -148,8 +147,8 @@ class JointStage:
             self._step_material(progress, diffuse)
             self._step_light(progress)
         self._follow_surface(rescan=(iteration + 1) % _RESCAN == 0)
-        error = sum(mean(dr.square(dr.detach(image)[..., :3] - self._targets[view][..., :3]))
-                    for view, image in zip(views, images, strict=True)) / len(views)
+        error = mi.Float(sum(mean(dr.square(dr.detach(image)[..., :3] - self._targets[view][..., :3]))
+                             for view, image in zip(views, images, strict=True)) / len(views))
         return {"loss": total[0], "image": color[0], "mask": mask[0],
                 **{name: value[0] for name, value in terms.items()},
                 "psnr": decibels(error[0])}
@@ -196,7 +195,7 @@ class JointStage:
 
     def _render(self, view: int, seed: int) -> mi.TensorXf:
         config = self.config.render
-        if self._turns:
+        if self.light and self._turns:
             self.parameters["light.to_world"] = self.light.turned(self._turns[view])
             self.parameters.update()
         with phase("render") as compute:
@@ -259,7 +258,7 @@ class JointStage:
 
     def _step_light(self, progress: float) -> None:
         optimizer = self.light_optimizer
-        if not optimizer.state:
+        if self.light is None or not optimizer.state:
             return
         gradient = finite(dr.grad(optimizer["log_radiance"]))
         dr.set_grad(optimizer["log_radiance"], gradient / self.light.solid_angles)

@@ -15,7 +15,7 @@ from ...errors import UserError
 from ...extraction.flexicubes import deviation
 from ...extraction.surface_mesh import SurfaceMesh
 from ...light import EnvironmentLight
-from ...material import MaterialField
+from ...material import GivenMaterial, MaterialField
 from ...means import mean
 from ...scene import FitScene
 from ...views import PinholeViews
@@ -89,7 +89,7 @@ class StepView:
         view: index of a view of the step.
     """
 
-    def __init__(self, fit: FitScene, scene: mi.Scene, material: MaterialField | None,
+    def __init__(self, fit: FitScene, scene: mi.Scene, material: MaterialField | GivenMaterial | None,
                  light: EnvironmentLight | None):
         self.fit, self.scene, self.material, self.light = fit, scene, material, light
         self.subject, self.view = fit.subject, 0
@@ -208,6 +208,7 @@ def _flexicubes_deviation(step: StepView) -> mi.Float:
 @register_loss("material_smoothness", needs="material")
 def _material_smoothness(step: StepView) -> mi.Float:
     """Differences of the material along edges."""
+    assert step.material is not None, "the loss needs it"
     surface, total = step.subject.surface, mi.Float(0)
     for field in step.material.values().values():
         channels = dr.width(field) // step.subject.lattice.vertex_count
@@ -219,4 +220,5 @@ def _material_smoothness(step: StepView) -> mi.Float:
 @register_loss("light_grey", needs="light")
 def _light_grey(step: StepView) -> mi.Float:
     """Grey-world prior of the light."""
+    assert step.light is not None, "the loss needs it"
     return losses.grey_world(dr.unravel(mi.Color3f, step.light.radiance.array))

@@ -329,7 +329,8 @@ class TopologyRevision:
     @property
     def _cell(self) -> float:
         """Size of a cell of the lattice on which openings have changed, or shall."""
-        return float(self._state.get("cell", self.joint.subject.cell_size))
+        cell = self._state.get("cell")
+        return float(self.joint.subject.cell_size if cell is None else cell)
 
     @property
     def _scale(self) -> float:
@@ -385,7 +386,7 @@ def _errors(found: Residuals, patch: np.ndarray, solid: np.ndarray, count: int |
         solid: (V,) surface.
         count: P; default as many as there are in ``patch``.
     """
-    count = patch.max(initial=-1) + 1 if count is None else count
+    count = int(patch.max(initial=-1)) + 1 if count is None else count
     label, counted = np.where(patch < 0, count, patch), (patch >= 0) | solid
     rays, now = (np.bincount(label[counted], sums[counted], count + 1) for sums in (found.rays, found.now))
     return np.maximum(now, 1e-6 * rays) / np.maximum(rays, 1.0)
