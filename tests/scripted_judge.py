@@ -20,7 +20,7 @@ class ScriptedJudge:
         self.count, self.error, self.noise = count, error, noise
         self.asked: list[np.ndarray] = []
 
-    def shown(self, mesh: Mesh) -> np.ndarray:
+    def shown(self, mesh: Mesh, like: np.ndarray | None = None) -> np.ndarray:
         """(V,) which of the template's vertices are opaque."""
         opaque = np.zeros(self.count, bool)
         used = np.unique(mesh[1])

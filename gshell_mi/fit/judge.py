@@ -97,9 +97,10 @@ class Judge:
         return [(PixelPool(self.views, self.targets, known),
                  PixelPool(self.views, self.targets, unknown, _OUTLINE)) for known, unknown in self.splits]
 
-    def shown(self, mesh: Mesh) -> Shown:
-        """A mesh as the images show it, once for each of the splits."""
-        return Shown(mesh, self.views, [known for known, _ in self._pools], batch=self.batch, seed=self.seed)
+    def shown(self, mesh: Mesh, like: Shown | None = None) -> Shown:
+        """A mesh as the images show it, once for each of the splits; it may mirror what another one does."""
+        return Shown(mesh, self.views, [known for known, _ in self._pools], batch=self.batch, seed=self.seed,
+                     like=like)
 
     def compare(self, before: Shown, after: Shown, places: tuple[Mesh, np.ndarray] | None = None) -> Verdict:
         """Judges a change.

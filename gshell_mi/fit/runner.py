@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -71,6 +72,8 @@ class Runner:
                 surface = stage.run(fit, surface, Steps(self, stage.name, surface))
                 checkpoint.stage, checkpoint.iteration, checkpoint.arrays = following, 0, surface.to_arrays()
                 self.save()
+                # Sizes that this stage needed are not those of the next.
+                dr.flush_malloc_cache()
         return surface
 
     def save(self) -> None:

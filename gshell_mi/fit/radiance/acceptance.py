@@ -50,7 +50,7 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
     kept, trimmed = opened, np.zeros_like(opened)
     for closing in reversed(range(_CLOSINGS)):
         place = places_of(kept, _lobes(kept, faces))
-        shown = _shown(judge, template, ~kept, logits)
+        shown = _shown(judge, template, ~kept, logits, closed)
         verdict = judge.compare(closed, shown, (template, place))
         worst = ~verdict.accepted
         # The worst first; all where none is worse but some are not surely better, and in the last round.
@@ -72,13 +72,13 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
     return np.where(opened & ~kept, -logits, logits)
 
 
-def open_rejected(logits: np.ndarray, template: Mesh, judge: Judge) -> np.ndarray:
+def open_rejected(logits: np.ndarray, template: Mesh, judge: Judge, closed: Shown) -> np.ndarray:
     """Opens the islands in openings that unseen views do not speak for.
 
     A highlight on the inside of a bowl may be explained by a piece of the lid.
 
     Args:
-        logits, template, judge: as of ``close_rejected``.
+        logits, template, judge, closed: as of ``close_rejected``.
 
     Returns:
         (V,) logits, those of rejected islands negated.
@@ -92,7 +92,8 @@ def open_rejected(logits: np.ndarray, template: Mesh, judge: Judge) -> np.ndarra
     if not island.any():
         return logits
     place = places_of(island, patch)
-    without, present = (_shown(judge, template, chosen, logits) for chosen in (solid & ~island, solid))
+    without, present = (_shown(judge, template, chosen, logits, closed)
+                        for chosen in (solid & ~island, solid))
     accepted = judge.compare(without, present, (template, place)).accepted
     return np.where(island & ~accepted[place], -logits, logits)
 
@@ -106,10 +107,11 @@ def _gains(judge: Judge, template: Mesh, before: Shown, after: Shown, chosen: np
     return smooth(mi.Float(gain.astype(np.float32))).numpy()
 
 
-def _shown(judge: Judge, template: Mesh, solid: np.ndarray, logits: np.ndarray) -> Shown:
+def _shown(judge: Judge, template: Mesh, solid: np.ndarray, logits: np.ndarray, closed: Shown) -> Shown:
     """The part of a template that is solid, its rims where the logits have them."""
     vertices, faces = template
-    return judge.shown(positive_part(vertices, faces, np.where(solid, np.abs(logits), -np.abs(logits))))
+    part = positive_part(vertices, faces, np.where(solid, np.abs(logits), -np.abs(logits)))
+    return judge.shown(part, like=closed)
 
 
 def _lobes(opened: np.ndarray, faces: np.ndarray) -> np.ndarray:

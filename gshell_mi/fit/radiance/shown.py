@@ -81,19 +81,22 @@ class Shown:
         pools: pixels that tell the colours; each has a look of its own.
         batch: pixels per batch of rays.
         seed: of the random pixels.
+        like: mirrors the same, as another part of the same surface does; default: that is found, too.
 
     Attributes:
         looks: one for each of the pools.
     """
 
-    def __init__(self, mesh: Mesh, views: PinholeViews, pools: list[PixelPool], *, batch: int, seed: int):
+    def __init__(self, mesh: Mesh, views: PinholeViews, pools: list[PixelPool], *, batch: int, seed: int,
+                 like: Shown | None = None):
         vertices, faces = mesh
         self._scene, self._corners = mesh_scene(vertices, faces), mi.UInt32(faces.astype(np.uint32).ravel())
         self._normals = vertex_normals(mi.Float(np.ascontiguousarray(vertices, np.float32).ravel()),
                                        mi.Vector3u(np.ascontiguousarray(faces.T, np.uint32)))
         self._count, self._smooth = len(vertices), MeshDiffusion(faces, len(vertices), _SMOOTHING)
         with dr.suspend_grad():
-            self.looks = [self._look(views, pool, batch, seed) for pool in pools]
+            self.looks = [self._look(views, pool, batch, seed, like.looks[index].mirrored if like else None)
+                          for index, pool in enumerate(pools)]
 
     @property
     def mirrored(self) -> Mirrored:
@@ -108,7 +111,8 @@ class Shown:
         dr.eval(radiance, alpha)
         return radiance, alpha
 
-    def _look(self, views: PinholeViews, pool: PixelPool, batch: int, seed: int) -> Look:
+    def _look(self, views: PinholeViews, pool: PixelPool, batch: int, seed: int,
+              known: Mirrored | None) -> Look:
         seen = []
         for step in range(_BATCHES):
             sample = pool.sample(batch, seed=seed, step=step)
@@ -116,9 +120,9 @@ class Shown:
             lane = dr.compress(met.hit & (sample.alpha > COVERED))
             seen.append((met.at(lane), dr.gather(mi.Color3f, sample.radiance, lane)))
             dr.eval(seen[-1])
-        mirrored = Mirrored.nothing()
+        mirrored = known or Mirrored.nothing()
         colors = self._colors(seen, mirrored)
-        for _ in range(_ROUNDS):
+        for _ in range(0 if known else _ROUNDS):
             mirrored = mirrored.improved([(met.mirrored, radiance, met.interpolate(colors))
                                           for met, radiance in seen[:_MIRRORED_BATCHES]])
             colors = self._colors(seen, mirrored)

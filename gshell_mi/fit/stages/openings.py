@@ -170,7 +170,7 @@ def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, clo
             if not ((candidate <= 0) & (logits > 0)).any():
                 continue
             found = clean(close_rejected(candidate, template, judge, closed))
-            found = clean(open_rejected(found, template, judge))
+            found = clean(open_rejected(found, template, judge, closed))
             logits = np.minimum(logits, found)
             if ((found <= 0) == (candidate <= 0)).all():
                 break

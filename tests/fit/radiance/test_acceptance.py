@@ -97,13 +97,13 @@ def test_an_island_has_to_be_justified(ball, without, stays):
     island, around = cap(ball, [0, 0, 1], 0.02), cap(ball, [0, 0, 1], 0.2)
     logits = np.where(around & ~island, -1.0, 2.0)
     judge = ScriptedJudge(len(logits), lambda opaque: np.where(opaque | ~island, 1.0, without))
-    result = open_rejected(logits, (ball.vertices, ball.faces), judge)
+    result = open_rejected(logits, (ball.vertices, ball.faces), judge, None)
     np.testing.assert_array_equal(result > 0, ~around | island if stays else ~around)
 
 
 def test_without_islands_nothing_is_asked(ball):
     logits = np.where(cap(ball, [0, 0, 1], 0.1), -1.0, 1.0)
-    assert open_rejected(logits, (ball.vertices, ball.faces), None) is logits
+    assert open_rejected(logits, (ball.vertices, ball.faces), None, None) is logits
 
 
 def test_nothing_open_nothing_asked(ball):
