@@ -54,6 +54,11 @@ def _import(folder: Path) -> None:
     command(main, folder / "source", "-o", folder / "out.xml", "--quiet", "--resolution", "8")
 
 
+def _imported(write: Callable[[Path], object], *files: str) -> Target:
+    """A capture. One that is no longer known as such is taken for mere photographs, whose work is kept."""
+    return Target(write, _import, *files, keeps="out.work")
+
+
 def _ignoring(folder: Path) -> None:
     """A capture with files of masks and ignore masks."""
     from PIL import Image
@@ -197,19 +202,19 @@ def _light(folder: Path) -> None:
 
 
 TARGETS = {
-    "nerf": Target(_capture("write_nerf", "nerfstudio"), _import, "*.json"),
-    "colmap_text": Target(_capture("write_colmap", "PINHOLE", False), _import, "*.txt"),
-    "colmap_binary": Target(_capture("write_colmap", "PINHOLE", True), _import, "*.bin"),
-    "idr": Target(_capture("write_idr"), _import, "*.npz"),
-    "llff": Target(_capture("write_llff"), _import, "*.npy"),
-    "mitsuba": Target(_capture("write_mitsuba"), _import, "*.xml", "*.exr"),
-    "images": Target(_images, _import, "*.png", "*.exr", "*.tif", "*.webp"),
+    "nerf": _imported(_capture("write_nerf", "nerfstudio"), "*.json"),
+    "colmap_text": _imported(_capture("write_colmap", "PINHOLE", False), "*.txt"),
+    "colmap_binary": _imported(_capture("write_colmap", "PINHOLE", True), "*.bin"),
+    "idr": _imported(_capture("write_idr"), "*.npz"),
+    "llff": _imported(_capture("write_llff"), "*.npy"),
+    "mitsuba": _imported(_capture("write_mitsuba"), "*.xml", "*.exr"),
+    "images": _imported(_images, "*.png", "*.exr", "*.tif", "*.webp"),
     "scene": Target(_scene, _load_scene, "bowl.xml", "*.exr"),
     **{f"mesh_{suffix}": Target(_mesh(suffix), _convert, "mesh.*")
        for suffix in ("ply", "obj", "stl", "glb", "off")},
     "closed_mesh": Target(_mesh("ply", open_at=9.0), _convert, "mesh.*"),
     "scores": Target(_mesh("ply"), _score, "mesh.*"),
-    "masks": Target(_ignoring, _import, "masks/*.png", "ignore/*.png"),
+    "masks": _imported(_ignoring, "masks/*.png", "ignore/*.png"),
     "known": Target(_known, _load_scene, "*.known.exr", "*.depth.exr"),
     **{f"video_{suffix}": Target(_video(suffix), _cut, "clip.*", keeps="out.work")
        for suffix in ("mp4", "avi", "mkv")},
