@@ -55,7 +55,7 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
         channels = 3 if name == "vertex_color" else 1
         values = np.array(surface.interpolate(field, channels).numpy())
         attributes[name] = values.T if channels == 3 else values
-    _write_surface(output / "mesh.ply", surface, attributes, texture, texture_levels)
+    vertices, faces = _write_surface(output / "mesh.ply", surface, attributes, texture, texture_levels)
     template = fit.subject.template()
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
     write_light(output / "light.exr", fit.light, light)
@@ -67,7 +67,6 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
             turns = turns_with_camera([fit.sensors[0], *(view.sensor for view in group)])[1:]
             lights = [light.turned(turn) for turn in turns] if light and light_turns else []
             scores[folder] = write_views(output, folder, group, lights)
-    vertices, faces, _ = surface.to_numpy()
     return {
         "scene": fit.path.name,
         "targets": str(fit.targets[0].path.parent.absolute()),
@@ -90,7 +89,8 @@ def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dic
 
 
 def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.ndarray],
-                   texture: np.ndarray | None = None, levels: int = 0) -> None:
+                   texture: np.ndarray | None = None, levels: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the vertices and faces that are written."""
     vertices, faces, _ = surface.to_numpy()
     normals = np.array(surface.vertex_normals().numpy()).T.reshape(-1, 3)
     vertices = without_slivers(vertices, faces, normals)
@@ -98,3 +98,4 @@ def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.nd
         vertices, faces, attributes = subdivided(vertices, faces, {"normal": normals} | attributes, levels)
         normals, attributes["vertex_color"] = unit(attributes.pop("normal")), texture
     write_ply(path, vertices, faces, normals, attributes)
+    return vertices, faces

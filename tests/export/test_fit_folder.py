@@ -74,6 +74,19 @@ def test_mesh_in_trimesh(exported, mesh):
     np.testing.assert_allclose(attribute(mesh, "metallic", 1), 0.1, atol=1e-5)
 
 
+def test_a_texture_is_on_the_divided_mesh(exported, tmp_path):
+    whole, faces, _ = exported.fit.subject.surface.to_numpy()
+    middles = len(np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
+    texture = np.random.default_rng(0).uniform(size=(len(whole) + middles, 3))
+    metrics = export_fit(tmp_path, exported.fit, exported.joint.material, exported.joint.light, 1, texture, 1)
+    divided = trimesh.load(tmp_path / "mesh.ply", process=False)
+    assert len(divided.faces) == 4 * len(faces) == metrics["counts"]["faces"]
+    assert loop_count(divided.faces) == metrics["counts"]["boundary_loops"] == 1
+    np.testing.assert_allclose(np.asarray(divided.vertices)[:len(whole)], whole, atol=1e-6)
+    np.testing.assert_allclose(attribute(divided, "color", 3), texture, atol=1e-6)
+    np.testing.assert_allclose(attribute(divided, "roughness", 1), 0.3, atol=1e-5)
+
+
 def test_normals_are_unit_and_point_outwards(mesh):
     data = mesh.metadata["_ply_raw"]["vertex"]["data"]
     normals = np.stack([np.ravel(data[name]) for name in ("nx", "ny", "nz")], axis=1)
