@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,15 @@ class Target:
     def __post_init__(self) -> None:
         if self.known is None:
             object.__setattr__(self, "known", np.ones(self.rgba.shape[:2], np.float32))
+
+    def divided(self, gain: np.ndarray) -> Target:
+        """The same with its channels divided by (3,) gains; alpha stays.
+
+        >>> grey = Target(Path("grey.exr"), np.ones((1, 1, 4), np.float32), True)
+        >>> grey.divided(np.array([2.0, 1.0, 0.5])).rgba.ravel().tolist()
+        [0.5, 1.0, 2.0, 1.0]
+        """
+        return replace(self, rgba=self.rgba / np.append(gain, 1).astype(np.float32))
 
 
 def load_target(path: Path, width: int, height: int) -> Target:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMaterial,
                light: EnvironmentLight | None, views: int, texture: np.ndarray | None = None,
-               texture_levels: int = 0, *, light_turns: bool = False) -> dict:
+               texture_levels: int = 0, *, light_turns: bool = False,
+               gains: np.ndarray | None = None) -> dict:
     """Writes meshes, light, scene and pictures of the views.
 
     Args:
@@ -41,6 +42,8 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
         texture: base colours at the vertices of the surface's mesh, divided ``texture_levels`` times; None
             leaves those of the material.
         light_turns: whether the light turns with the camera: then it is stored as the first view has it.
+        gains: (N, 3) that each view's channels are multiplied by, as its target was exposed so; None if all
+            were exposed alike.
 
     Returns:
         The metrics, which ``write_metrics`` stores.
@@ -66,17 +69,19 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
             # The first training view has the light as it is stored.
             turns = turns_with_camera([fit.sensors[0], *(view.sensor for view in group)])[1:]
             lights = [light.turned(turn) for turn in turns] if light and light_turns else []
-            scores[folder] = write_views(output, folder, group, lights)
+            exposed = gains[chosen] if folder == TRAINING and gains is not None else ()
+            scores[folder] = write_views(output, folder, group, lights, exposed)
     return {
         "scene": fit.path.name,
         "targets": str(fit.targets[0].path.parent.absolute()),
         "psnr_training": scores[TRAINING]["mean"]["psnr"],
         "training": scores[TRAINING],
         **({"held_out": scores[HELD_OUT]} if fit.held_out else {}),
+        **({} if gains is None else {"exposures": _exposures(fit, gains)}),
         "counts": dataclasses.asdict(topology(vertices, faces)),
         "versions": {name: version(name) for name in ("gshell_mi", "mitsuba", "drjit", "numpy")},
         "variant": mi.variant(),
-    }
+    } | ({} if gains is None else {"exposures": _exposures([sensor.id() for sensor in fit.sensors], gains)})
 
 
 def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dict:
@@ -86,6 +91,18 @@ def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dic
     with replacing(output / "metrics.json") as partial:
         partial.write_text(json.dumps(metrics, indent=1), encoding="utf-8")
     return metrics
+
+
+def _exposures(fit: FitScene, gains: np.ndarray) -> dict[str, Any]:
+    """How (N, 3) gains expose the views: the mean of their channels in stops, what these differ by from it,
+    and their spread."""
+    names, channels = [sensor.id() for sensor in fit.sensors], np.log2(gains)
+    stops = channels.mean(axis=1)
+    return {"spread_stops": round(float(stops.std()), 4),
+            "spread_white_balance": round(float((channels - stops[:, None]).std()), 4),
+            "stops": {name: round(float(value), 4) for name, value in zip(names, stops, strict=True)},
+            "gains": {name: [round(float(value), 5) for value in gain]
+                      for name, gain in zip(names, gains, strict=True)}}
 
 
 def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.ndarray],

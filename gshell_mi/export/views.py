@@ -34,7 +34,8 @@ def view_files(training: Iterable[str], held_out: Iterable[str]) -> list[str]:
     return [f"{folder}/{name}.png" for place, name in views for folder in (place, MASKS)]
 
 
-def write_views(output: Path, folder: str, views: Sequence[View], lights: Sequence[mi.Transform4f]) -> dict:
+def write_views(output: Path, folder: str, views: Sequence[View], lights: Sequence[mi.Transform4f],
+                gains: Sequence[np.ndarray] | np.ndarray = ()) -> dict:
     """Renders the exported scene; writes a triptych per view and, if its target has alpha, the masks.
 
     Args:
@@ -42,6 +43,8 @@ def write_views(output: Path, folder: str, views: Sequence[View], lights: Sequen
         folder: in it, for the triptychs.
         views: one or more.
         lights: per view ``to_world`` of the light, if it turns with the camera.
+        gains: per view what its three channels are multiplied by, as its target was exposed so; none if all
+            were exposed alike.
 
     Returns:
         ``views``, the scores by view, and ``mean``, rounded: an entry of ``metrics.json``.
@@ -55,6 +58,8 @@ def write_views(output: Path, folder: str, views: Sequence[View], lights: Sequen
             parameters["light.to_world"] = lights[index]
             parameters.update()
         image = np.array(mi.render(scene, sensor=view.sensor, integrator=integrator, spp=_SPP))
+        if len(gains):
+            image[..., :3] *= gains[index]
         name, target = view.sensor.id(), view.target
         scores[name] = view_scores(image, target)
         write_png(output / folder / f"{name}.png", triptych(target.rgba, image))

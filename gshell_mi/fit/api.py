@@ -160,7 +160,7 @@ def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report:
         fitted = Fitted.of(fit, surface)
         metrics = export_fit(output, fit.scene, fitted.material, fitted.light, fit.config.triptychs,
                              fitted.texture, fitted.texture_levels,
-                             light_turns=fit.config.light_frame == "camera")
+                             light_turns=fit.config.light_frame == "camera", gains=surface.gains)
         metrics["config"] = dataclasses.asdict(fit.config)
         metrics |= fitted.findings(fit, progress.warn) | {"warnings": progress.warnings}
 

@@ -12,6 +12,7 @@ from .joint.config import LossConfig, ModelConfig, RenderConfig
 from .radiance.config import VolumeConfig
 from .radiance.surface_radiance import RadianceConfig
 from .stages.cavities import CavitiesConfig
+from .stages.exposures import GainsConfig
 from .stages.hull import HullConfig
 from .stages.joint import DetailConfig, JointConfig
 from .stages.openings import OpeningsConfig
@@ -48,6 +49,9 @@ class FitConfig:
     a camera on a tripod. The exported light is then as the first view has it."""
     fixed_material: bool = False
     """Keep the uniform principled material that the scene gives the gshell shape."""
+    exposures: Literal["find", "keep"] = "find"
+    """Whether views may differ in exposure and white balance: find the gain of each, if that explains what
+    they see of the same places, or keep all images as they are."""
     geometry_only: bool = False
     """Optimise nothing but the geometry, and from the images alone: light and material are those of the
     scene, the mask loss of the joint stage is off, and shading normals are those of the faces."""
@@ -76,6 +80,8 @@ class FitConfig:
     """The radiance on a mesh, by which the stages up to the refinement judge."""
     openings: OpeningsConfig = field(default_factory=OpeningsConfig)
     """Where the hull is open."""
+    gains: GainsConfig = field(default_factory=GainsConfig)
+    """Exposure and white balance of each view."""
     cavities: CavitiesConfig = field(default_factory=CavitiesConfig)
     """Hollows that the hull bridges."""
     refinement: RefinementConfig = field(default_factory=RefinementConfig)

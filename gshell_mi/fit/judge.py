@@ -140,7 +140,7 @@ class Judge:
                     for total, value in zip(sums, (mi.Float(1), *errors), strict=True):
                         dr.scatter_reduce(dr.ReduceOp.Add, total, value, lane, counts)
                     dr.eval(sums)
-        return _verdict(*(total.numpy().reshape(-1, views) for total in sums))
+        return verdict_of(*(total.numpy().reshape(-1, views) for total in sums))
 
     def decide(self, before: Mesh, after: Mesh) -> Verdict:
         """Judges one change of the whole surface."""
@@ -161,7 +161,7 @@ def places_of(chosen: np.ndarray, patch: np.ndarray) -> np.ndarray:
     return place
 
 
-def _verdict(rays: np.ndarray, before: np.ndarray, after: np.ndarray) -> Verdict:
+def verdict_of(rays: np.ndarray, before: np.ndarray, after: np.ndarray) -> Verdict:
     """From (P, N) rays of each place and view, and the sums of their errors."""
     total, seen = rays.sum(axis=1), (rays > 0).sum(axis=1)
     mean = np.maximum(total / np.maximum(seen, 1), 1)[:, None]

@@ -17,6 +17,7 @@ from .config import FitConfig
 _PROGRAM = 280 * 2**20  # Python, Mitsuba, LLVM and its kernels
 _ASSET = 350 * 2**20  # baking the textures of mesh.glb
 _PER_PIXEL = 80  # of all targets: NumPy's copy, pools of stages and judge, outlines
+_PER_CORRECTED = 16  # of all targets once more, if their exposures differ
 _PER_VERTEX = 490  # of the lattice: fields and material, their Adam moments and gradients
 _PER_HULL_SAMPLE = 75  # of the visual hull, which is finer than the lattice, and ...
 _PER_VOTE = 4  # ... what it keeps there per view that has to see daylight
@@ -72,13 +73,14 @@ class MemoryEstimate:
             weights = min(weights, _WEIGHTS_PER_SQUARE_CELL * resolution**2)
         vertices = make_lattice(grid, whole).vertex_count
         pixels = np.asarray(sizes, np.int64).prod(axis=1)
+        corrected = _PER_CORRECTED if config.exposures == "find" else 0
         votes = config.hull.daylight_votes * len(pixels)
         hull_samples = (thin_part_refinement(whole) * whole + 1) ** 3
         return cls(
             program=_PROGRAM + (_ASSET if report else 0),
             hull=int((_PER_HULL_SAMPLE + _PER_VOTE * votes) * hull_samples),
             lattice=_PER_VERTEX * vertices + _PER_SQUARE_CELL * resolution**2 + _PER_WEIGHT * weights,
-            targets=_PER_PIXEL * int(pixels.sum()),
+            targets=(_PER_PIXEL + corrected) * int(pixels.sum()),
             samples=_PER_SAMPLE * int(pixels.max()) * max(config.render.primal_spp, config.render.spp),
             volume=_PER_SQUARE_VOXEL * config.volume.side**2 if config.volume.iterations else 0)
 

@@ -8,6 +8,7 @@ from .config import FitConfig
 from .lattices import Lattices
 from .stage import Stage
 from .stages.cavities import Cavities
+from .stages.exposures import Exposures
 from .stages.hull import Given, Hull
 from .stages.joint import Joint
 from .stages.openings import Openings
@@ -27,9 +28,14 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
     """
     given = bool(scene.subject.filename)
     start: list[Stage] = [Given() if given else Hull(config.hull)]  # masks, or a file
-    if not given or Given.is_closed(scene, lattices, config):
+    found = config.exposures == "find" and not config.geometry_only
+    exposures: list[Stage] = [Exposures(config.gains)] if found else []
+    if given and not Given.is_closed(scene, lattices, config):
+        start += exposures                                          # a gain for each view
+    else:
         start += [
             Openings(config.openings),                              # where the hull is open
+            *exposures,
             Cavities(config.cavities),                              # what the hull bridges
             Refinement("refinement", config.refinement, first=True),    # moves whole parts ...
             Refinement("folds", config.folds, first=False),         # ... then details

@@ -52,7 +52,7 @@ class Runner:
 
         Args:
             stages: all of them, in their order.
-            fit: what they may read.
+            fit: what they may read; of targets, those that come out of it once the exposures are known.
             surface: what the first one begins with.
 
         Returns:
@@ -67,9 +67,12 @@ class Runner:
             raise UserError(f"The checkpoint '{self._path}' is in the stage '{checkpoint.stage}', which this "
                             f"fit has not; start without --resume.")
         self._rewind_log(names)
+        seen, gains = fit, None
         for stage, following in zip(stages, names[1:], strict=True):
             if stage.name == checkpoint.stage:
-                surface = stage.run(fit, surface, Steps(self, stage.name, surface))
+                if surface.gains is not None and surface.gains is not gains:
+                    seen, gains = fit.corrected(surface.gains), surface.gains
+                surface = stage.run(seen, surface, Steps(self, stage.name, surface))
                 checkpoint.stage, checkpoint.iteration, checkpoint.arrays = following, 0, surface.to_arrays()
                 self.save()
                 # Sizes that this stage needed are not those of the next.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
@@ -33,11 +33,13 @@ class Fit:
         scene: with its targets. Only the joint stage changes its shape.
         config: the settings.
         lattices: that stages work on.
+        gains: (N, 3) that the scene's targets have been divided by; None if they are as given.
     """
 
     scene: FitScene
     config: FitConfig
     lattices: Lattices
+    gains: np.ndarray | None = None
 
     @cached_property
     def views(self) -> PinholeViews:
@@ -79,6 +81,20 @@ class Fit:
         every = np.arange(len(self.views))
         held_out = every[::_HOLD_OUT]
         return np.setdiff1d(every, held_out) if len(every) > 1 else every, held_out
+
+    def corrected(self, gains: np.ndarray) -> Fit:
+        """The same with targets as if all views were exposed alike.
+
+        The pools of this one are let go, and made again if they are asked for: two of each would be as large
+        as the targets many times over.
+
+        Args:
+            gains: (N, 3) what each view's channels were multiplied by.
+        """
+        for pool in ("pixels", "training", "judge", "held_out_judge"):
+            self.__dict__.pop(pool, None)
+        targets = [target.divided(gain) for target, gain in zip(self.scene.targets, gains, strict=True)]
+        return replace(self, scene=replace(self.scene, targets=targets), gains=gains)
 
     def cell(self, surface: Surface) -> float:
         """Side of a cell of a surface's lattice in world units."""

@@ -14,7 +14,7 @@ _NEEDED = {"scene": str, "psnr_training": float, "training": dict, "counts": dic
            "versions": dict, "config": dict}
 
 #: Those that may be missing.
-_OPTIONAL = {"warnings": list, "diagnostics": dict, "held_out": dict}
+_OPTIONAL = {"warnings": list, "diagnostics": dict, "held_out": dict, "exposures": dict}
 
 #: Entries within them that a page takes for numbers.
 _NUMBERS = {"counts": ("vertices", "faces", "boundary_loops", "components"), "seconds": ("total",)}

@@ -286,6 +286,20 @@ def test_the_light_turns_with_held_out_cameras_too(exported, tmp_path, monkeypat
         np.testing.assert_allclose(given[view.sensor.id()], expected, atol=1e-6)
 
 
+def test_views_are_exposed_as_their_targets(exported, tmp_path):
+    gains = np.ones((VIEWS, 3), np.float32)
+    gains[0], gains[-1] = [0.25, 1, 1], 0.5
+    told = export_fit(tmp_path, exported.fit, exported.joint.material, exported.joint.light, 2, gains=gains)
+    assert told["exposures"]["gains"]["view_000"] == [0.25, 1, 1]
+    assert told["exposures"]["stops"]["view_011"] == -1 and told["exposures"]["stops"]["view_005"] == 0
+    before, after = (np.array(Image.open(folder / "views" / "view_000.png"))[:, SIZE:2 * SIZE].astype(int)
+                     for folder in (exported.output, tmp_path))
+    object_ = before.min(axis=-1) < 250
+    assert (after[object_, 0] < 0.8 * before[object_, 0]).mean() > 0.8
+    assert np.abs(after[..., 1:] - before[..., 1:]).mean() < 5
+    assert "exposures" not in exported.metrics
+
+
 def test_metrics(exported, mesh):
     stored = json.loads((exported.output / "metrics.json").read_text())
     assert stored == exported.metrics

@@ -8,8 +8,7 @@ import trimesh
 from bowl import RADIUS, half_sphere
 from scipy.spatial import Delaunay
 
-from gshell_mi.fit.judge import Judge, Verdict
-from gshell_mi.fit.judge import _verdict as _judged
+from gshell_mi.fit.judge import Judge, Verdict, verdict_of
 from gshell_mi.scene import load_fit_scene
 from gshell_mi.views import PinholeViews
 
@@ -83,11 +82,11 @@ def test_a_constant_residual_neither_passes_nor_blocks_a_change():
     rays, noise = np.full((1, 40), 100.0), rng.normal(0, 1, (1, 40))
     for residual in (0.1, 10.0):
         before = 100 * (residual + 0.5 + 0.02 * noise)
-        assert _judged(rays, before, before - 50).accepted
-        assert not _judged(rays, before, before + 2 * rng.normal(0, 1, (1, 40))).accepted
+        assert verdict_of(rays, before, before - 50).accepted
+        assert not verdict_of(rays, before, before + 2 * rng.normal(0, 1, (1, 40))).accepted
 
 
 def test_few_views_are_not_enough():
     rays = np.zeros((1, 40))
     rays[:, :3] = 100
-    assert not _judged(rays, 100.0 * (rays > 0), 10.0 * (rays > 0)).accepted
+    assert not verdict_of(rays, 100.0 * (rays > 0), 10.0 * (rays > 0)).accepted

@@ -15,7 +15,8 @@ from gshell_mi.fit.lattices import Lattices
 from gshell_mi.fit.pipeline import pipeline
 from gshell_mi.lattice import TetLattice
 
-START = ["openings", "cavities", "refinement", "folds", "revoxelise"]
+START = ["openings", "exposures", "cavities", "refinement", "folds", "revoxelise"]
+KEPT = [stage for stage in START if stage != "exposures"]
 
 
 def names(subject: mi.Shape, settings: dict) -> list[str]:
@@ -30,6 +31,8 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
     ({"iterations": 0}, ["hull", *START, "volume", "joint"]),
     ({"detail.iterations": 0}, ["hull", *START, "volume", "joint", "texture"]),
     ({"model.field": "hashgrid"}, ["hull", *START, "volume", "joint", "texture"]),
+    ({"exposures": "keep"}, ["hull", *KEPT, "volume", "joint", "detail", "texture"]),
+    ({"geometry_only": True}, ["hull", *KEPT, "volume", "joint", "detail", "texture"]),
     ({"texture.rounds": 0}, ["hull", *START, "volume", "joint", "detail"]),
     ({"model.field": "flexicubes"}, ["hull", *START, "volume", "joint", "detail", "texture"]),
 ])
@@ -38,7 +41,8 @@ def test_stages_from_masks(settings, expected):
 
 
 @pytest.mark.parametrize(("opened", "settings", "expected"), [
-    (True, {}, ["given", "joint", "detail", "texture"]),
+    (True, {}, ["given", "exposures", "joint", "detail", "texture"]),
+    (True, {"exposures": "keep"}, ["given", "joint", "detail", "texture"]),
     (False, {}, ["given", *START, "joint", "detail", "texture"]),
     (True, {"watertight": True}, ["given", *START, "joint", "detail", "texture"]),
 ])

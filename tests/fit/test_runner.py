@@ -138,7 +138,8 @@ def test_a_surface_is_what_its_arrays_say(tmp_path):
              for name in ("folds", "refinement")]
     seen = Seen(np.ones((count, 3)), np.ones(count, bool), np.float32(2))
     whole = replace(START, hull=np.arange(count), seen=seen, moved=tuple(moved),
-                    model={"log_radiance": np.ones((2, 4, 3))}, revision={"points": np.ones(2)})
+                    model={"log_radiance": np.ones((2, 4, 3))}, revision={"points": np.ones(2)},
+                    gains=np.full((3, 3), 1.1))
     checkpoint = Checkpoint("joint", 0, {}, whole.to_arrays())
     checkpoint.save(tmp_path / "checkpoint.npz")
     found = Surface.from_arrays(Checkpoint.load(tmp_path / "checkpoint.npz").arrays)
@@ -149,3 +150,4 @@ def test_a_surface_is_what_its_arrays_say(tmp_path):
         np.testing.assert_array_equal(array, whole.to_arrays()[name])
     bare = Surface.from_arrays(START.to_arrays())
     assert bare.hull is None and bare.seen is None and not bare.moved and not bare.model
+    assert bare.gains is None

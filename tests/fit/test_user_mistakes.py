@@ -215,7 +215,7 @@ def test_unknown_variant(told):
 
 @pytest.mark.parametrize(("option", "value"), [
     ("--render.spp", "0"), ("--radiance.batch", "0"), ("--iterations", "-1"), ("--render.max-depth", "1"),
-    ("--joint.warmup", "1.5"),
+    ("--joint.warmup", "1.5"), ("--gains.prior", "0"), ("--gains.places", "0"),
     ("--resolution", "0"), ("--checkpoint-seconds", "-1"), ("--losses.light-grey", "-0.1"),
 ])
 def test_setting_out_of_range(told, option, value):

@@ -70,7 +70,8 @@ def best_revoxelised(fit: Fit, template: Template, moved: Iterable[Moved], latti
             if fields:
                 closed = LatticeFields.closed(fields["sdf"], lattice.grid)
                 seen = Seen(fields["radiance"], fields["known"], light)
-                return Surface(replace(closed, msdf=fields["msdf"]), seen=seen), candidate.stage
+                found = Surface(replace(closed, msdf=fields["msdf"]), seen=seen, gains=fit.gains)
+                return found, candidate.stage
     return None, ""
 
 

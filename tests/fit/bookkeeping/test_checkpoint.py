@@ -107,8 +107,9 @@ def test_without_header(tmp_path):
         Checkpoint.load(tmp_path / "checkpoint.npz")
 
 
-def test_another_version(tmp_path):
-    header = json.dumps({"format": FORMAT + 1, "something": "else"})
+@pytest.mark.parametrize("version", [FORMAT - 1, FORMAT + 1])
+def test_another_version(version, tmp_path):
+    header = json.dumps({"format": version, "something": "else"})
     np.savez(tmp_path / "checkpoint.npz", header=np.array(header))
     with pytest.raises(UserError, match="written by another version of gshell_mi"):
         Checkpoint.load(tmp_path / "checkpoint.npz")

@@ -1,0 +1,54 @@
+"""Exposures: photographs of the same surface differ in exposure and white balance, and views disagree by it.
+
+No later stage knows of that: each is given targets that are corrected. Renders, whose views agree, stay as
+they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+
+from ...light import turns_with_camera
+from ..bounds import Between
+from ..exposures.gains import find_gains
+from ..exposures.observations import observe
+from ..runner import Steps
+from ..stage import Fit
+from ..surface import Surface
+
+
+@dataclass(frozen=True)
+class GainsConfig:
+    """Exposure and white balance of the views."""
+
+    places: Annotated[int, Between(1)] = 2048
+    """Vertices, at most, whose colours in different views are compared."""
+    prior: Annotated[float, Between(0.001)] = 1 / 3
+    """Standard deviation in stops before anything was seen: cameras are set in steps of a third."""
+
+
+class Exposures:
+    """Finds a gain per view and channel, if that explains what views see of the same places."""
+
+    name = "exposures"
+
+    def __init__(self, config: GainsConfig):
+        self.config = config
+
+    def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
+        """The surface with the gains of the views, or with none if they do not count."""
+        config, scene = fit.config, fit.scene
+        with steps.task():
+            turns = None
+            if config.light_frame == "camera":
+                turns = np.array([np.array(turn.matrix)[:3, :3] for turn in turns_with_camera(scene.sensors)])
+            mesh = scene.subject.surface_of(surface.fields).to_numpy()[:2]
+            seen = observe(mesh, fit.views, scene.targets, places=self.config.places, cell=fit.cell(surface),
+                           turns=turns, seed=config.seed)
+            found = find_gains(seen, self.config.prior * np.log(2))
+        steps.fact("exposures_verdict", found.verdict.facts() | {"look": found.look})
+        steps.fact("exposures_kept", found.count)
+        return replace(surface, gains=np.exp(found.log_gain).astype(np.float32)) if found.count else surface
