@@ -81,7 +81,7 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
         "counts": dataclasses.asdict(topology(vertices, faces)),
         "versions": {name: version(name) for name in ("gshell_mi", "mitsuba", "drjit", "numpy")},
         "variant": mi.variant(),
-    } | ({} if gains is None else {"exposures": _exposures([sensor.id() for sensor in fit.sensors], gains)})
+    }
 
 
 def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dict:
