@@ -29,7 +29,8 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
     cap does, and may open there. But the sheet behind such a hole is farther from the truth than the hull,
     so the images disagree more. What hangs together by a narrow neck only is judged in parts. Through one
     opening others are seen, so the worst are closed first. Where a part is rejected, it is first closed
-    where its own vertices speak against it, and judged again: an opening may run on into gloss beside it.
+    where its own vertices speak against it, if that is not most of it, and judged again: an opening may run
+    on into gloss beside it.
 
     Args:
         logits: (V,) opacity logits; surface where positive.
@@ -63,6 +64,9 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
         anew = rejected & ~trimmed
         if closing and anew.any():
             anew &= _gains(judge, template, closed, shown, anew) > 0
+            # Crumbs of what is rejected are chance: there are so many of them.
+            share = np.bincount(place[kept], anew[kept]) / np.bincount(place[kept])
+            anew &= share[place] > 0.5
         else:
             anew[:] = False
         kept = kept & (~rejected | anew)

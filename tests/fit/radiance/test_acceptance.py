@@ -85,11 +85,16 @@ def test_what_a_neck_joins_is_judged_apart(ball):
 
 def test_an_opening_is_trimmed_where_its_own_vertices_speak_against_it(ball):
     """The opening is right at the pole, and runs on into what is much worse for it."""
-    opened, right = cap(ball, [0, 0, 1], 0.3), cap(ball, [0, 0, 1], 0.1)
-    result, _ = _closed(ball, np.where(opened, -1.0, 1.0),
-                        lambda opaque: np.where(opaque, 1.0, np.where(right, 0.1, 9.0)))
-    beside = cap(ball, [0, 0, 1], 0.05)
-    assert (result[beside] < 0).all() and (result[~right] > 0).all()
+    opened, right = cap(ball, [0, 0, 1], 0.3), cap(ball, [0, 0, 1], 0.2)
+
+    def error(better):
+        return lambda opaque: np.where(opaque, 1.0, np.where(better, 0.2, 30.0))
+
+    result, _ = _closed(ball, np.where(opened, -1.0, 1.0), error(right))
+    inner, outer = cap(ball, [0, 0, 1], 0.15), cap(ball, [0, 0, 1], 0.25)
+    assert (result[inner] < 0).all() and (result[~outer] > 0).all()
+    crumbs, _ = _closed(ball, np.where(opened, -1.0, 1.0), error(cap(ball, [0, 0, 1], 0.05)))
+    assert (crumbs > 0).all()
 
 
 @pytest.mark.parametrize(("without", "stays"), [(1.05, False), (1.5, True)])
