@@ -15,7 +15,7 @@ SHORT = ("--openings.iterations", "100", "--radiance.batch", "16384", "--radianc
          "--openings.mask", "0.01", "--openings.binary", "0.015", "--openings.closing", "0.003",
          "--cavities.iterations", "10", "--cavities.batch", "4096", "--volume.iterations", "0",
          "--refinement.iterations", "8", "--folds.iterations", "0", "--iterations", "12",
-         "--render.spp", "2", "--render.primal-spp", "4", "--render.max-depth", "2",
+         "--render.spp", "2", "--render.primal-spp", "4", "--render.max-depth", "2", "--texture.rounds", "0",
          "--model.light-height", "8", "--no-report")
 
 #: Added to these where openings do not matter: hardly any steps, and the template stays closed.

@@ -120,7 +120,8 @@ class Judge:
         with dr.suspend_grad():
             for split, (_, pixels) in enumerate(self._pools):
                 tone = Contrast(pixels.mean_radiance())
-                coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0))
+                # Without masks all of an image is covered: who sees nothing there has explained nothing.
+                coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0) if pixels.has_alpha else 3.0)
                 for step in range(_JUDGED):
                     sample = pixels.sample(self.batch, seed=self.seed, step=step)
                     ray, place, counts = self._rays(sample), mi.Int32(0), mi.Bool(True)

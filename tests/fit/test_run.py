@@ -194,10 +194,12 @@ def test_interrupted_by_the_user(bowl_scene, tmp_path):
 def test_killed_and_resumed(bowl_scene, tmp_path):
     """Killed once in each stage, the fit takes the steps that it would have taken."""
     # Which vertices a revision opens is a choice, and rounding alone leads to another one.
-    whole, killed, options = tmp_path / "whole", tmp_path / "killed", ("--joint.revision", "1")
+    options = "--joint.revision", "1", "--texture.rounds", "1"
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert fit(bowl_scene, whole, *options) == 0
     for stage, iteration, resume in (("openings", 30, ()), ("cavities", 5, ("--resume",)),
-                                     ("refinement", 3, ("--resume",)), ("joint", 1, ("--resume",))):
+                                     ("refinement", 3, ("--resume",)), ("joint", 1, ("--resume",)),
+                                     ("texture", 2, ("--resume",))):
         process = start(bowl_scene, killed, "--checkpoint-seconds", "0.05", *options, *resume)
         wait_for_step(process, killed, stage, iteration)
         process.kill()
@@ -211,7 +213,7 @@ def test_killed_and_resumed(bowl_scene, tmp_path):
     # gradient. Where vertices move, differences grow tenfold with every step. Two whole runs agree to 1e-5
     # before; to 2 % in the refinement; in the joint stage to 1e-4 at first, a few per cent at the end.
     expected, found = (np.array([step["loss"] for step in log(output)]) for output in (whole, killed))
-    tolerance = {"openings": 1e-3, "cavities": 1e-3, "refinement": 0.06, "joint": 0.2}
+    tolerance = {"openings": 1e-3, "cavities": 1e-3, "refinement": 0.06, "joint": 0.2, "texture": 0.2}
     allowed = [1e-3 if stage == "joint" and iteration <= 2 else tolerance[stage]
                for stage, iteration in steps(whole)]
     np.testing.assert_array_less(np.abs(found / expected - 1), allowed)

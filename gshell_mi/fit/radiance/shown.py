@@ -30,6 +30,9 @@ _SMOOTHING = 0.5
 #: Vertices (V, 3) and faces (F, 3).
 Mesh = tuple[np.ndarray, np.ndarray]
 
+#: A triangle that no ray meets, for a mesh without any.
+_NOTHING = np.zeros((3, 3)), np.array([[0, 1, 2]])
+
 
 @dataclass(frozen=True)
 class Look:
@@ -89,7 +92,7 @@ class Shown:
 
     def __init__(self, mesh: Mesh, views: PinholeViews, pools: list[PixelPool], *, batch: int, seed: int,
                  like: Shown | None = None):
-        vertices, faces = mesh
+        vertices, faces = mesh if len(mesh[1]) else _NOTHING
         self._scene, self._corners = mesh_scene(vertices, faces), mi.UInt32(faces.astype(np.uint32).ravel())
         self._normals = vertex_normals(mi.Float(np.ascontiguousarray(vertices, np.float32).ravel()),
                                        mi.Vector3u(np.ascontiguousarray(faces.T, np.uint32)))
@@ -118,6 +121,8 @@ class Shown:
             sample = pool.sample(batch, seed=seed, step=step)
             met = self._met(views.rays(sample.view, sample.film))
             lane = dr.compress(met.hit & (sample.alpha > COVERED))
+            if not dr.width(lane):
+                continue  # what is left of a surface may be too small for any ray to meet
             seen.append((met.at(lane), dr.gather(mi.Color3f, sample.radiance, lane)))
             dr.eval(seen[-1])
         mirrored = known or Mirrored.nothing()
