@@ -65,8 +65,8 @@ class Mirrored:
         """The factor that explains images best if the surface has given colours.
 
         Args:
-            samples: of rays, the mirrored directions, the radiance in the images, and the colours. Without any,
-                nothing changes.
+            samples: of rays, the mirrored directions, the radiance in the images, and the colours. Without
+                any, nothing changes.
         """
         left, right = np.zeros((3, _COUNT, _COUNT)), np.zeros((3, _COUNT))
         for direction, radiance, color in samples:
