@@ -153,7 +153,7 @@ def _averages(target: Target, side: int) -> tuple[np.ndarray, np.ndarray]:
     whether all of a square is the object's and known, and nothing clipped."""
     rgba = target.rgba
     color, alpha = rgba[..., :3], rgba[..., 3]
-    spoilt = (alpha < COVERED) | (target.known < COVERED)
+    spoilt = (alpha < COVERED) | (np.asarray(target.known) < COVERED)
     if color.max() <= 1:
         spoilt |= color.max(axis=-1) > _CLIPPED
     whole = ~ndimage.maximum_filter(spoilt, side, mode="constant", cval=True)
