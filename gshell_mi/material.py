@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,6 +11,9 @@ from numpy.typing import ArrayLike
 
 from .activations import sigmoid
 from .fields.carried import Carried
+
+if TYPE_CHECKING:
+    from .extraction import SurfaceMesh
 
 #: Range of roughness: below, paths to a small light become too rare for a fit's few samples.
 ROUGHNESS_RANGE = (0.08, 1.0)
@@ -94,6 +99,17 @@ class GivenMaterial:
     def values(self) -> dict[str, mi.Float]:
         """The lattice fields by attribute name."""
         return dict(self._values)
+
+
+def attributes_of(material: MaterialField | GivenMaterial, mesh: SurfaceMesh) -> dict[str, np.ndarray]:
+    """A material at the vertices of a mesh that was extracted from its lattice, by attribute name: (V, 3) or
+    (V,)."""
+    found = {}
+    for name, field in material.values().items():
+        channels = 3 if name == "vertex_color" else 1
+        values = np.array(mesh.interpolate(field, channels).numpy())
+        found[name] = values.T if channels == 3 else values
+    return found
 
 
 def given_material(bsdf: mi.BSDF) -> dict:

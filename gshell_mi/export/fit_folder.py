@@ -13,6 +13,7 @@ import numpy as np
 
 from ..files import replacing
 from ..light import turns_with_camera
+from ..material import attributes_of
 from ..own_folder import OwnFolder
 from ..subdivision import subdivided
 from ..topology import topology
@@ -53,12 +54,8 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
     names = [[view.sensor.id() for view in group] for group in shown.values()]
     OwnFolder(output, "fit").claim("mesh.ply", "template.ply", "light.exr", "scene.xml", *view_files(*names))
     surface = fit.subject.surface
-    attributes = {}
-    for name, field in material.values().items():
-        channels = 3 if name == "vertex_color" else 1
-        values = np.array(surface.interpolate(field, channels).numpy())
-        attributes[name] = values.T if channels == 3 else values
-    vertices, faces = _write_surface(output / "mesh.ply", surface, attributes, texture, texture_levels)
+    vertices, faces = _write_surface(output / "mesh.ply", surface, attributes_of(material, surface), texture,
+                                     texture_levels)
     template = fit.subject.template()
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
     write_light(output / "light.exr", fit.light, light)

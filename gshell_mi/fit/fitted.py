@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 
 from ..diagnostics import diagnose
-from ..extraction import SurfaceMesh
 from ..light import EnvironmentLight
 from ..material import GivenMaterial, MaterialField, given_material
 from .joint.depth import depth_error
@@ -29,7 +28,6 @@ class Fitted:
         light: None if it is the scene's own.
         texture: (V, 3) base colours of the surface's mesh, divided ``texture_levels`` times; or None.
         scene: of the surface under that light.
-        mesh: the surface's.
     """
 
     material: MaterialField | GivenMaterial
@@ -37,7 +35,6 @@ class Fitted:
     texture: np.ndarray | None
     texture_levels: int
     scene: mi.Scene
-    mesh: SurfaceMesh
 
     @classmethod
     def of(cls, fit: Fit, surface: Surface) -> Fitted:
@@ -52,16 +49,7 @@ class Fitted:
             material.parameters = {name: mi.Float(surface.model[name]) for name in material.parameters}
         light, model = start_light(fit.scene, surface, config), surface.model
         return cls(material, light, model.get("texture"), int(model.get("texture_levels", 0)),
-                   optimised_scene(fit.scene, light), subject.surface)
-
-    def attributes(self) -> dict[str, np.ndarray]:
-        """The material at the vertices of the surface's mesh, (V, 3) or (V,), by attribute name."""
-        found = {}
-        for name, field in self.material.values().items():
-            channels = 3 if name == "vertex_color" else 1
-            values = np.array(self.mesh.interpolate(field, channels).numpy())
-            found[name] = values.T if channels == 3 else values
-        return found
+                   optimised_scene(fit.scene, light))
 
     def findings(self, fit: Fit, warn: Callable[[str], None]) -> dict:
         """Entries of ``metrics.json``: ``diagnostics`` and, with depth maps, ``depth_error``.

@@ -15,6 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...activations import sigmoid
+from ...compat import write_mesh
 from ...images import decibels
 from ...material import principled
 from ...pixels import COVERED
@@ -65,11 +67,9 @@ class FineMesh:
         for name, size, values in (("vertex_color", 3, self.color), ("vertex_roughness", 1, self.roughness),
                                    ("vertex_metallic", 1, self.metallic)):
             mesh.add_attribute(name, size, np.ascontiguousarray(values, np.float32).ravel())
-        parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(self.vertices, np.float32).ravel())
-        parameters["vertex_normals"] = mi.Float(np.ascontiguousarray(self.normals, np.float32).ravel())
-        parameters["faces"] = mi.UInt32(np.ascontiguousarray(self.faces, np.uint32).ravel())
-        parameters.update()
+        positions, normals = (mi.Float(np.ascontiguousarray(values, np.float32).ravel())
+                              for values in (self.vertices, self.normals))
+        write_mesh(mesh, positions, mi.UInt32(np.ascontiguousarray(self.faces, np.uint32).ravel()), normals)
         return mesh
 
 
@@ -112,7 +112,7 @@ class BackProjection:
 
     def colors(self) -> np.ndarray:
         """(V, 3) base colour."""
-        return _colors(self._logits).numpy().reshape(-1, 3)
+        return sigmoid(self._logits).numpy().reshape(-1, 3)
 
     def step(self, iteration: int) -> dict[str, float]:
         """Looks at the next view."""
@@ -162,7 +162,7 @@ class BackProjection:
         """Ends a round. After two of them steps get smaller: noise averages out (Robbins and Monro 1951)."""
         vertex = dr.arange(mi.UInt32, len(self._mesh.vertices))
         images, renders, color, logits = (dr.gather(mi.Color3f, values, vertex) for values in (
-            self._sums["images"], self._sums["renders"], _colors(self._logits), self._logits))
+            self._sums["images"], self._sums["renders"], sigmoid(self._logits), self._logits))
         told = dr.log((images + _PRIOR) / (renders + _PRIOR))
         logits += told * dr.minimum(dr.rcp(1 - color), _STEEPEST) / dr.opaque(mi.Float, max(turn, 1))
         dr.scatter(self._logits, logits, vertex, mode=dr.ReduceMode.Permute)
@@ -171,14 +171,10 @@ class BackProjection:
         self._show()
 
     def _show(self) -> None:
-        self._parameters[self._color] = _colors(self._logits)
+        self._parameters[self._color] = sigmoid(self._logits)
         self._parameters.update()
 
 
 def _logit(color: np.ndarray) -> np.ndarray:
     color = np.clip(color, _SATURATED, 1 - _SATURATED)
     return np.log(color / (1 - color)).astype(np.float32)
-
-
-def _colors(logits: mi.Float) -> mi.Float:
-    return dr.rcp(1 + dr.exp(-logits))

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...light import turns_with_camera
+from ...material import attributes_of
 from ...subdivision import subdivided
 from ...triangles import unit, vertex_areas
 from ..bounds import Between
@@ -49,7 +50,8 @@ class Texture:
         if not len(faces):
             return surface
         levels = _levels(vertices, faces, fit)
-        attributes = fitted.attributes() | {"normal": np.array(mesh.vertex_normals().numpy()).T}
+        normals = np.array(mesh.vertex_normals().numpy()).T
+        attributes = attributes_of(fitted.material, mesh) | {"normal": normals}
         vertices, faces, fine = subdivided(vertices, faces, attributes, levels)
         start = FineMesh(vertices, faces, unit(fine["normal"]), fine["vertex_color"],
                          fine["vertex_roughness"], fine["vertex_metallic"])
