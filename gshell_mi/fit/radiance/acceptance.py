@@ -21,6 +21,30 @@ _CLOSINGS, _WORST = 7, 0.5
 _SMOOTHING = 10.0
 
 
+def close_shallow(logits: np.ndarray, faces: np.ndarray, thin: np.ndarray) -> np.ndarray:
+    """Closes the openings most of which have the template's other side close behind them.
+
+    A hull is up to about a cell outside of the surface. Through a hole in a thin one, such as a leaf's, the
+    images see what they see of a wall that is a little farther in; which side a sheet keeps, if not both, is
+    told when they have moved.
+
+    Args:
+        logits: (V,) opacity logits; surface where positive.
+        faces: (F, 3) of the template.
+        thin: (V,) where the other side is within two cells.
+
+    Returns:
+        (V,) logits, those of closed openings negated.
+
+    >>> triangles = np.array([[0, 1, 2], [3, 4, 5]])
+    >>> close_shallow(np.full(6, -1.0), triangles, np.array([True, True, False, True, False, False])).tolist()
+    [1.0, 1.0, 1.0, -1.0, -1.0, -1.0]
+    """
+    opened, patch = logits <= 0, equal_patches(logits <= 0, faces)
+    shallow = 2 * np.bincount(patch, thin) > np.bincount(patch)
+    return np.where(opened & shallow[patch], -logits, logits)
+
+
 def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
                    closed: Shown) -> np.ndarray:
     """Closes the openings through which unseen views are not explained better than without them.

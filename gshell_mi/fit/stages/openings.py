@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated
 
 import drjit as dr
@@ -24,10 +23,11 @@ from ...means import mean
 from ...pixels import FAINT
 from ...schedules import decay_at
 from ...template.msdf import clean_opacity, msdf_from_template, splat_to_lattice
+from ...template.sides import opposite_sides
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from ..judge import Judge
-from ..radiance.acceptance import close_rejected, open_rejected
+from ..radiance.acceptance import close_rejected, close_shallow, open_rejected
 from ..radiance.shown import Mesh, Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
@@ -87,9 +87,11 @@ class Openings:
         with steps.task("verdict"):
             logits = np.ones(len(vertices))
             if not fit.config.watertight:
+                thickness, _ = opposite_sides(template.start, template.start, faces, fit.cell(surface))
                 logits = find_openings(appearance, template.closed, fit.judge, closed, self.config.rounds,
-                                       partial(clean_opacity, vertices=vertices, faces=faces,
-                                               min_area=fit.config.min_area),
+                                       lambda logits: close_shallow(
+                                           clean_opacity(logits, vertices, faces, fit.config.min_area),
+                                           faces, np.isfinite(thickness)),
                                        lambda again: steps.repeat(training, count, again * count))
             opened = logits <= 0
             appearance.refit(~opened)
@@ -150,7 +152,8 @@ def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, clo
         judge: of the fit.
         closed: the template as the judge shows it.
         rounds: in which it is trained again, at most.
-        clean: undoes cuts and islands of (V,) logits that are too small, as ``clean_opacity`` does.
+        clean: undoes what cannot be meant in (V,) logits: cuts and islands that are too small, as
+            ``clean_opacity`` does, and cuts as of ``close_shallow``.
         train: does all steps of its training; told for which time, after the first, from 1.
 
     Returns:
