@@ -45,7 +45,8 @@ class PixelPool:
     """The pixels of targets, whatever their sizes, each equally likely to be drawn.
 
     All templates lie within the visual hull, so rays far outside the masks meet nothing, and nothing is to be
-    learnt from them. On most photographs those are most pixels. They count, but are not drawn.
+    learnt from them. On most photographs those are most pixels. They count, but are not drawn. What is
+    unknown is not drawn either.
 
     Args:
         views: the cameras.
@@ -58,7 +59,8 @@ class PixelPool:
                  off_outline: int = 0):
         chosen = np.arange(len(views)) if chosen is None else chosen
         targets = [targets[index] for index in chosen]
-        places = [_tiled(_near_object(target) & ~_on_outline(target, off_outline)) for target in targets]
+        places = [_tiled(_near_object(target) & _known(target) & ~_on_outline(target, off_outline))
+                  for target in targets]
         rgba = np.concatenate([target.rgba[*place.T] for target, place in zip(targets, places, strict=True)])
         self._pixels = mi.Float(rgba.ravel())
         self._view = mi.UInt32(np.repeat(chosen, [len(place) for place in places]))
@@ -128,6 +130,12 @@ def _near_object(target: Target) -> np.ndarray:
     mask = ndimage.binary_fill_holes(target.rgba[..., 3] > FAINT)
     near = ndimage.maximum_filter(mask, 2 * _MARGIN + 1)
     return near if near.any() else np.ones_like(near)
+
+
+def _known(target: Target) -> np.ndarray:
+    """(height, width) whether all of a pixel is known; everywhere if nothing is."""
+    known = np.asarray(target.known) > COVERED
+    return known if known.any() else np.ones_like(known)
 
 
 def _on_outline(target: Target, distance: int) -> np.ndarray:

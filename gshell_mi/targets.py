@@ -37,6 +37,11 @@ class Target:
         if self.known is None:
             object.__setattr__(self, "known", np.ones(self.rgba.shape[:2], np.float32))
 
+    @property
+    def most_alpha(self) -> np.ndarray:
+        """(height, width) the largest coverage that what is known allows."""
+        return np.maximum(self.rgba[..., 3], 1 - np.asarray(self.known))
+
     def divided(self, gain: np.ndarray) -> Target:
         """The same with its channels divided by (3,) gains; alpha stays.
 

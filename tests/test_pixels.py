@@ -56,6 +56,18 @@ def test_a_mean_times_the_share_is_one_over_all_pixels(drawn):
     assert len(sample.alpha) == round((1 << 16) * pool.share[0]), "as many to a pixel as asked for"
 
 
+def test_what_is_unknown_is_not_drawn():
+    targets = []
+    for width, height in SIZES:
+        known = np.ones((height, width), np.float32)
+        known[:, :width // 2] = 0
+        targets.append(Target(None, ring(width, height).rgba, True, known=known))
+    sample = PixelPool(views(), targets).sample(1 << 14, seed=3, step=5)
+    assert sample.film.numpy()[0].min() >= 0.5
+    nothing = [Target(None, each.rgba, True, known=np.zeros_like(each.known)) for each in targets]
+    assert len(PixelPool(views(), nothing).sample(64, seed=3, step=5).alpha), "there is always something"
+
+
 def test_without_masks_all_pixels_are_drawn():
     targets = [Target(None, np.ones((height, width, 4), np.float32), False) for width, height in SIZES]
     pool = PixelPool(views(), targets)

@@ -16,6 +16,7 @@ from .stages.exposures import GainsConfig
 from .stages.hull import HullConfig
 from .stages.joint import DetailConfig, JointConfig
 from .stages.openings import OpeningsConfig
+from .stages.poses import CamerasConfig
 from .stages.refinement import FoldsConfig, RefinementConfig
 from .stages.texture import TextureConfig
 
@@ -52,6 +53,9 @@ class FitConfig:
     exposures: Literal["find", "keep"] = "find"
     """Whether views may differ in exposure and white balance: find the gain of each, if that explains what
     they see of the same places, or keep all images as they are."""
+    poses: Literal["refine", "keep"] = "refine"
+    """Whether cameras may be off by a pixel or a few: correct them where the surface that all views agree on
+    says so clearly, or keep them."""
     geometry_only: bool = False
     """Optimise nothing but the geometry, and from the images alone: light and material are those of the
     scene, the mask loss of the joint stage is off, and shading normals are those of the faces."""
@@ -98,6 +102,8 @@ class FitConfig:
     """What the joint and the detail stage minimise; docs/losses.md has the formulas."""
     joint: JointConfig = field(default_factory=JointConfig)
     """Geometry, material and light by path tracing."""
+    cameras: CamerasConfig = field(default_factory=CamerasConfig)
+    """Corrections of the poses."""
     detail: DetailConfig = field(default_factory=DetailConfig)
     """The joint stage continued on a finer lattice."""
     texture: TextureConfig = field(default_factory=TextureConfig)

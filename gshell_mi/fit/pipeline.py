@@ -12,6 +12,7 @@ from .stages.exposures import Exposures
 from .stages.hull import Given, Hull
 from .stages.joint import Joint
 from .stages.openings import Openings
+from .stages.poses import Poses
 from .stages.refinement import Refinement
 from .stages.revoxelise import Revoxelise
 from .stages.texture import Texture
@@ -48,6 +49,7 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
     if config.iterations and config.detail.iterations and explicit:
         start += [
             Joint("joint", config.joint, config.iterations, lattices.late),     # shape, material and light
+            *([Poses(config.cameras)] if config.poses == "refine" else []),     # corrects the cameras
             Joint("detail", config.detail, config.detail.iterations, lattices.last, refines=True),
         ]
     else:

@@ -52,7 +52,8 @@ class Runner:
 
         Args:
             stages: all of them, in their order.
-            fit: what they may read; of targets, those that come out of it once the exposures are known.
+            fit: what they may read; of targets and cameras, those that come out of it once the exposures and
+                the poses are known.
             surface: what the first one begins with.
 
         Returns:
@@ -67,11 +68,11 @@ class Runner:
             raise UserError(f"The checkpoint '{self._path}' is in the stage '{checkpoint.stage}', which this "
                             f"fit has not; start without --resume.")
         self._rewind_log(names)
-        seen, gains = fit, None
+        seen, gains, poses = fit, None, None
         for stage, following in zip(stages, names[1:], strict=True):
             if stage.name == checkpoint.stage:
-                if surface.gains is not None and surface.gains is not gains:
-                    seen, gains = fit.corrected(surface.gains), surface.gains
+                if surface.gains is not gains or surface.poses is not poses:
+                    seen, gains, poses = fit.corrected(surface), surface.gains, surface.poses
                 surface = stage.run(seen, surface, Steps(self, stage.name, surface))
                 checkpoint.stage, checkpoint.iteration, checkpoint.arrays = following, 0, surface.to_arrays()
                 self.save()

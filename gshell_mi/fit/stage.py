@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
+import mitsuba as mi
 import numpy as np
 
 from ..pixels import PixelPool
@@ -15,6 +16,7 @@ from ..views import PinholeViews
 from .bookkeeping.observer import Preview
 from .judge import Judge
 from .lattices import Lattices
+from .poses.corrections import Corrections
 from .surface import Surface
 
 if TYPE_CHECKING:
@@ -48,8 +50,8 @@ class Fit:
 
     @cached_property
     def alphas(self) -> list[np.ndarray]:
-        """Coverage of each view, (height, width)."""
-        return [target.rgba[..., 3] for target in self.scene.targets]
+        """Coverage of each view, (height, width), the largest that what is known allows."""
+        return [target.most_alpha for target in self.scene.targets]
 
     @cached_property
     def pixels(self) -> PixelPool:
@@ -82,19 +84,31 @@ class Fit:
         held_out = every[::_HOLD_OUT]
         return np.setdiff1d(every, held_out) if len(every) > 1 else every, held_out
 
-    def corrected(self, gains: np.ndarray) -> Fit:
-        """The same with targets as if all views were exposed alike.
+    def corrected(self, surface: Surface) -> Fit:
+        """The same with targets as if all views were exposed alike, and cameras where the surface says.
 
         The pools of this one are let go, and made again if they are asked for: two of each would be as large
         as the targets many times over.
 
         Args:
-            gains: (N, 3) what each view's channels were multiplied by.
+            surface: that the gains and the corrections are of; of a fit as it was given.
         """
         for pool in ("pixels", "training", "judge", "held_out_judge"):
             self.__dict__.pop(pool, None)
-        targets = [target.divided(gain) for target, gain in zip(self.scene.targets, gains, strict=True)]
-        return replace(self, scene=replace(self.scene, targets=targets), gains=gains)
+        gains, targets = surface.gains, self.scene.targets
+        if gains is not None:
+            targets = [target.divided(gain) for target, gain in zip(targets, gains, strict=True)]
+        scene = replace(self.scene, sensors=self._posed_sensors(surface), targets=targets)
+        return replace(self, scene=scene, gains=gains)
+
+    def posed(self, surface: Surface) -> Fit:
+        """The same with cameras where the surface says, and targets as they were given."""
+        return replace(self, scene=replace(self.scene, sensors=self._posed_sensors(surface)))
+
+    def _posed_sensors(self, surface: Surface) -> list[mi.Sensor]:
+        """The sensors where the surface says; of a fit as it was given."""
+        sensors = self.scene.sensors
+        return sensors if surface.poses is None else Corrections.from_array(surface.poses).sensors(sensors)
 
     def cell(self, surface: Surface) -> float:
         """Side of a cell of a surface's lattice in world units."""

@@ -61,6 +61,7 @@ class Surface:
         model: material, light and texture that later stages have left, flat arrays by name.
         revision: what a topology revision has changed, for the stages after it; flat arrays by name.
         gains: (N, 3) what each view's channels are multiplied by, as it was exposed; None if by nothing.
+        poses: (N, 6) corrections of the cameras, as of ``Corrections``; None if they are as given.
     """
 
     fields: LatticeFields
@@ -70,6 +71,7 @@ class Surface:
     model: Mapping[str, np.ndarray] = field(default_factory=dict)
     revision: Mapping[str, np.ndarray] = field(default_factory=dict)
     gains: np.ndarray | None = None
+    poses: np.ndarray | None = None
 
     @property
     def lattice(self) -> Lattice | BlockLattice:
@@ -89,7 +91,7 @@ class Surface:
         arrays = {"grid": np.array(GRIDS.index(self.fields.grid)),
                   "block_resolution": np.array(self.fields.block_resolution)}
         optional = {name: getattr(self.fields, name) for name in (*_FIELDS, *_OPTIONAL)}
-        optional |= {"hull": self.hull, "gains": self.gains}
+        optional |= {"hull": self.hull, "gains": self.gains, "poses": self.poses}
         arrays |= {name: array for name, array in optional.items() if array is not None}
         if self.seen:
             arrays |= {name: getattr(self.seen, name) for name in ("radiance", "known", "light")}
@@ -114,7 +116,7 @@ class Surface:
         stages = sorted({tuple(name.split(" ")[1:3]) for name in arrays if name.startswith("moved ")})
         moved = [_moved(stage, _under(arrays, f"moved {index} {stage} ")) for index, stage in stages]
         return cls(fields, arrays.get("hull"), seen, tuple(moved), _under(arrays, "model "),
-                   _under(arrays, "revision "), arrays.get("gains"))
+                   _under(arrays, "revision "), arrays.get("gains"), arrays.get("poses"))
 
 
 def _moved(stage: str, arrays: Mapping[str, np.ndarray]) -> Moved:

@@ -14,7 +14,8 @@ _NEEDED = {"scene": str, "psnr_training": float, "training": dict, "counts": dic
            "versions": dict, "config": dict}
 
 #: Those that may be missing.
-_OPTIONAL = {"warnings": list, "diagnostics": dict, "held_out": dict, "exposures": dict}
+_OPTIONAL = {"warnings": list, "diagnostics": dict, "held_out": dict, "exposures": dict,
+             "poses": dict}
 
 #: Entries within them that a page takes for numbers.
 _NUMBERS = {"counts": ("vertices", "faces", "boundary_loops", "components"), "seconds": ("total",)}
@@ -57,6 +58,8 @@ def _problem(metrics: object) -> str | None:
     for name in ("training", "held_out"):
         if name in metrics and not _are_scores(metrics[name]):
             return f"'{name}' holds no scores of views"
+    if not _are_corrections(metrics):
+        return "'poses' or 'exposures' holds no numbers of views"
     return None
 
 
@@ -68,6 +71,16 @@ def _are_scores(entry: dict) -> bool:
     return all(isinstance(scores, dict) and _is_number(scores.get("psnr"))
                and all(score is None or _is_number(score) for score in scores.values())
                for scores in (*views.values(), entry.get("mean")))
+
+
+def _are_corrections(metrics: dict) -> bool:
+    """Whether what is told of poses and exposures, if anything is, is numbers by view."""
+    views = metrics.get("poses", {}).get("views", {})
+    if not (isinstance(views, dict) and all(isinstance(view, dict) for view in views.values())):
+        return False
+    stops = metrics.get("exposures", {}).get("stops", {})
+    return isinstance(stops, dict) and all(
+        _is_number(value) for told in (stops, *views.values()) for value in told.values())
 
 
 def _is_number(value: object) -> bool:

@@ -24,7 +24,15 @@ from .curves import curves
 from .data_urls import data_url, image_url
 from .metrics import read_metrics
 from .viewer_model import viewer_model
-from .views import HEADINGS, held_out_pictures, mask_pictures, score_rows, training_pictures
+from .views import (
+    CORRECTION_HEADINGS,
+    HEADINGS,
+    correction_rows,
+    held_out_pictures,
+    mask_pictures,
+    score_rows,
+    training_pictures,
+)
 
 _PROBE_HEIGHT = 160
 
@@ -86,6 +94,7 @@ def _write(folder: Path, metrics: dict, config: ReportConfig) -> Path:
         headings=HEADINGS, training=training_pictures(folder, config.views, metrics),
         training_rows=score_rows(metrics["training"]), held_out=held_out_pictures(folder, metrics),
         held_out_rows=score_rows(metrics["held_out"]) if "held_out" in metrics else [],
+        corrections=correction_rows(metrics), correction_headings=CORRECTION_HEADINGS,
         masks=mask_pictures(folder, metrics), colors=_COLORS,
         curves=[Markup(drawing) for drawing in curves(folder / "log.jsonl")],
         probe=image_url(_probe(folder / "light.exr")))

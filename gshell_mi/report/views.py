@@ -25,6 +25,11 @@ _SIDE = 320
 _COLUMNS = (("psnr", "PSNR, dB", 2), ("psnr_inside", "inside the mask, dB", 2), ("ssim", "SSIM", 4),
             ("flip", "FLIP", 4), ("mask_iou", "IoU of the masks", 4))
 
+#: Columns of the table of corrections: heading and digits.
+_CORRECTIONS = (("pixels", "pixels", 2), ("degrees", "degrees", 3), ("stops", "stops", 3))
+
+CORRECTION_HEADINGS = [heading for _, heading, _ in _CORRECTIONS]
+
 HEADINGS = [heading for _, heading, _ in _COLUMNS]
 
 
@@ -33,6 +38,17 @@ def score_rows(scored: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
     views = sorted(scored["views"].items(), key=lambda view: view[1]["psnr"])
     return [(name, [_shown(scores.get(score), digits) for score, _, digits in _COLUMNS])
             for name, scores in [("mean", scored["mean"]), *views]]
+
+
+def correction_rows(metrics: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
+    """Rows of a table of how views were corrected: by how much in the image, about which angle, and how much
+    brighter than the others they were exposed; the largest first. None if they are as given."""
+    poses, stops = metrics.get("poses", {}).get("views", {}), metrics.get("exposures", {}).get("stops", {})
+    views = {name: poses.get(name, {}) | ({"stops": stops[name]} if name in stops else {})
+             for name in poses | stops}
+    size = {name: (told.get("pixels", 0), abs(told.get("stops", 0))) for name, told in views.items()}
+    return [(name, [_shown(views[name].get(column), digits) for column, _, digits in _CORRECTIONS])
+            for name in sorted(views, key=lambda name: size[name], reverse=True)]
 
 
 def training_pictures(folder: Path, count: int, metrics: dict) -> list[dict]:

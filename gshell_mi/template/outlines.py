@@ -5,8 +5,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy import ndimage
 
 from ..fields.mask_outline import mask_distance, sharp
+from ..targets import Target
 from ..topology import mesh_edges
 from ..views import PinholeViews
 from .normals import vertex_normals
@@ -17,6 +19,9 @@ _CLEARANCE = 1.5
 #: Contour points farther than this from the mask's outline, in pixels, do not know which outline is theirs.
 _REACH = 6.0
 
+#: Pixels around what is unknown in which an outline may be that of the unknown.
+_AROUND = 3
+
 
 class Outlines:
     """The silhouette of a closed mesh against the masks of all views.
@@ -26,12 +31,12 @@ class Outlines:
 
     Args:
         views: the cameras.
-        alphas: per view, (height, width) coverage.
+        targets: their images; masks' outlines that are unknown, or beside what is, do not count.
         faces: (F, 3) vertex indices of a watertight mesh.
         solid: (V,) False for vertices that are no surface; edges with such a vertex do not count.
     """
 
-    def __init__(self, views: PinholeViews, alphas: list[np.ndarray], faces: np.ndarray, solid: np.ndarray):
+    def __init__(self, views: PinholeViews, targets: list[Target], faces: np.ndarray, solid: np.ndarray):
         self.views = views
         self._faces = mi.Vector3u(faces.T.astype(np.uint32))
         self._vertex_count = len(solid)
@@ -40,9 +45,12 @@ class Outlines:
         self._edges = mi.Vector2u(edges.T.astype(np.uint32))
         self._edge_count = len(edges)
         diagonal = float(max(np.hypot(*size) for size in views.sizes))
+        alphas = [target.most_alpha for target in targets]
         thin_parts = sharp(alphas)
         distances = [mask_distance(alpha, fill_holes=False, thin_parts=thin_parts).clip(-diagonal, diagonal)
                      for alpha in alphas]
+        distances = [np.where(_beside_unknown(target), diagonal, distance)
+                     for target, distance in zip(targets, distances, strict=True)]
         counts = views.sizes.prod(axis=1)
         self._distances = mi.Float(np.concatenate([d.ravel() for d in distances]).astype(np.float32))
         self._first = mi.UInt32(np.concatenate([[0], np.cumsum(counts)[:-1]]))
@@ -99,3 +107,9 @@ class Outlines:
         corner = dr.gather(mi.UInt32, self._first, view) + mi.UInt32(row) * width + mi.UInt32(column)
         texel = [dr.gather(mi.Float, self._distances, corner + step) for step in (0, 1, width, width + 1)]
         return dr.lerp(dr.lerp(texel[0], texel[1], fx), dr.lerp(texel[2], texel[3], fx), fy)
+
+
+def _beside_unknown(target: Target) -> np.ndarray:
+    """(height, width) what is unknown of an image, and the pixels around."""
+    unknown = np.asarray(target.known) < 0.5
+    return ndimage.binary_dilation(unknown, iterations=_AROUND) if unknown.any() else unknown

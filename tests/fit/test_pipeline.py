@@ -26,25 +26,26 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
 
 
 @pytest.mark.parametrize(("settings", "expected"), [
-    ({}, ["hull", *START, "volume", "joint", "detail", "texture"]),
-    ({"volume.iterations": 0}, ["hull", *START, "joint", "detail", "texture"]),
+    ({}, ["hull", *START, "volume", "joint", "poses", "detail", "texture"]),
+    ({"volume.iterations": 0}, ["hull", *START, "joint", "poses", "detail", "texture"]),
     ({"iterations": 0}, ["hull", *START, "volume", "joint"]),
     ({"detail.iterations": 0}, ["hull", *START, "volume", "joint", "texture"]),
     ({"model.field": "hashgrid"}, ["hull", *START, "volume", "joint", "texture"]),
-    ({"exposures": "keep"}, ["hull", *KEPT, "volume", "joint", "detail", "texture"]),
-    ({"geometry_only": True}, ["hull", *KEPT, "volume", "joint", "detail", "texture"]),
-    ({"texture.rounds": 0}, ["hull", *START, "volume", "joint", "detail"]),
-    ({"model.field": "flexicubes"}, ["hull", *START, "volume", "joint", "detail", "texture"]),
+    ({"exposures": "keep"}, ["hull", *KEPT, "volume", "joint", "poses", "detail", "texture"]),
+    ({"geometry_only": True}, ["hull", *KEPT, "volume", "joint", "poses", "detail", "texture"]),
+    ({"poses": "keep"}, ["hull", *START, "volume", "joint", "detail", "texture"]),
+    ({"texture.rounds": 0}, ["hull", *START, "volume", "joint", "poses", "detail"]),
+    ({"model.field": "flexicubes"}, ["hull", *START, "volume", "joint", "poses", "detail", "texture"]),
 ])
 def test_stages_from_masks(settings, expected):
     assert names(mi.load_dict({"type": "gshell", "resolution": 12}), settings) == expected
 
 
 @pytest.mark.parametrize(("opened", "settings", "expected"), [
-    (True, {}, ["given", "exposures", "joint", "detail", "texture"]),
-    (True, {"exposures": "keep"}, ["given", "joint", "detail", "texture"]),
-    (False, {}, ["given", *START, "joint", "detail", "texture"]),
-    (True, {"watertight": True}, ["given", *START, "joint", "detail", "texture"]),
+    (True, {}, ["given", "exposures", "joint", "poses", "detail", "texture"]),
+    (True, {"exposures": "keep"}, ["given", "joint", "poses", "detail", "texture"]),
+    (False, {}, ["given", *START, "joint", "poses", "detail", "texture"]),
+    (True, {"watertight": True}, ["given", *START, "joint", "poses", "detail", "texture"]),
 ])
 def test_stages_from_given_fields(tmp_path, opened, settings, expected):
     ball = sphere(TetLattice(12))

@@ -22,6 +22,7 @@ from gshell_mi.report import ReportConfig, write_report
 from gshell_mi.report.__main__ import main
 from gshell_mi.report.metrics import read_metrics
 from gshell_mi.report.viewer_model import boundary_tubes, viewer_model
+from gshell_mi.report.views import correction_rows
 from gshell_mi.topology import topology
 
 SMALL = ReportConfig(turntable_frames=3, turntable_size=64, turntable_spp=2, views=2)
@@ -58,7 +59,8 @@ def folder(tmp_path_factory):
         "scene": "ball <&>.xml", "psnr_training": 31.25, "training": TRAINING, "held_out": HELD_OUT,
         "counts": asdict(topology(mesh.vertices, mesh.faces)), "seconds": {"hull": 1.0, "total": 1.0},
         "versions": {"gshell_mi": "0"}, "warnings": ["1 floater <here>"], "diagnostics": {"floaters": 1},
-        "peak_memory_mib": 900, "variant": "llvm_ad_rgb", "config": asdict(FitConfig())}))
+        "poses": {"views": {"view_000": {"pixels": 0.3, "degrees": 0.02}}}, "peak_memory_mib": 900,
+        "variant": "llvm_ad_rgb", "config": asdict(FitConfig())}))
     lines = [{"stage": "joint", "iteration": i, "loss": 0.1 / (i + 1), "psnr": 20 + i, "seconds": 0.1}
              for i in range(5)]
     (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -78,10 +80,23 @@ def test_page_is_self_contained(folder):
     assert "daylight_votes" in text and "seconds.hull" in text
 
 
+def test_corrections_come_largest_first(folder):
+    page = (folder / "report.html").read_text().partition("<h2>Corrections</h2>")[2]
+    assert "<tr><td>view_000</td><td>0.30</td><td>0.020</td><td>–</td></tr>" in page
+    metrics = {"poses": {"views": {"view_000": {"pixels": 0.3, "degrees": 0.02, "shift": 0.1},
+                                   "view_001": {"pixels": 1.2, "degrees": 0.2, "shift": 0.1}}},
+               "exposures": {"stops": {"view_001": -0.25, "view_002": 0.5}}}
+    assert correction_rows(metrics) == [("view_001", ["1.20", "0.200", "-0.250"]),
+                                        ("view_000", ["0.30", "0.020", "–"]),
+                                        ("view_002", ["–", "–", "0.500"])]
+    assert correction_rows({}) == []
+
+
 def test_held_out_views_come_worst_first(folder):
     page = (folder / "report.html").read_text().partition('<script type="module">')[0]
     assert "28.50 dB on 2 held-out views" in page
     held_out, training = page.partition("<h2>Held-out views</h2>")[2].split("<h2>Training views</h2>")
+    training = training.partition("<h2>Corrections</h2>")[0]
     rows = re.findall(r"<td>(view_\d+|mean)</td><td>([^<]*)</td><td>([^<]*)</td>", held_out)
     assert rows == [("mean", "28.50", "–"), ("view_004", "28.00", "–"), ("view_003", "29.00", "–")]
     told = re.findall(r"<figcaption>(.*)</figcaption>", held_out)
@@ -133,6 +148,9 @@ def test_metrics_of_a_fit_are_read(tmp_path):
         ({"seconds": {}}, "'seconds.total' is no"), ({"training": {}}, "'training' holds"),
         ({"training": TRAINING | {"mean": 5}}, "'training' holds"),
         ({"held_out": 5}, "'held_out' is no dict"),
+        ({"poses": {"views": {"view_000": {"pixels": "many"}}}}, "'poses' or 'exposures' holds"),
+        ({"poses": {"views": [1]}}, "'poses' or 'exposures' holds"),
+        ({"exposures": {"stops": {"view_000": None}}}, "'poses' or 'exposures' holds"),
         ({"held_out": {"views": {"a": {"psnr": None}}, "mean": {"psnr": 1}}}, "'held_out' holds"),
         ({"held_out": {"views": {"a": {"psnr": 1, "ssim": "x"}}, "mean": {"psnr": 1}}}, "'held_out' holds"),
         ({"warnings": "x"}, "'warnings' is no list"), ({"diagnostics": 1}, "'diagnostics' is no"),

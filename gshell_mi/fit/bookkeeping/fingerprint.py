@@ -12,6 +12,7 @@ import numpy as np
 from ...errors import UserError
 from ...lattice import Lattice
 from ...scene import FitScene
+from ...targets import Target
 
 #: What a message calls the parts, and what they are where that is short.
 _PARTS = {
@@ -41,9 +42,15 @@ def fingerprint(scene: FitScene, lattice: Lattice) -> dict[str, Any]:
         "objects": _digest(*map(_of_parameters, others)),
         "views": {name: _of_parameters(view.sensor, view.sensor.film().rfilter())
                   for name, view in views.items()},
-        "targets": {name: _digest(view.target.rgba, *([] if view.target.depth is None else
-                                                      [view.target.depth])) for name, view in views.items()},
+        "targets": {name: _digest(*_arrays(view.target)) for name, view in views.items()},
     }
+
+
+def _arrays(target: Target) -> list[np.ndarray]:
+    """What a target tells; that all of it is known, or no depths, adds nothing."""
+    known = np.asarray(target.known)
+    return ([target.rgba] + ([] if target.depth is None else [target.depth])
+            + ([] if known.all() else [known]))
 
 
 def check_fingerprint(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:

@@ -137,7 +137,8 @@ class BackProjection:
                           seed=seed % 2**32)
         rendered, target = (dr.unravel(mi.Vector4f, values) for values in (
             image.array, mi.Float(self._targets[view].rgba.ravel())))
-        covered = (rendered.w > COVERED) & (target.w > COVERED)
+        known = mi.Float(np.asarray(self._targets[view].known).ravel())
+        covered = (rendered.w > COVERED) & (target.w > COVERED) & (known > COVERED)
         rendered, target = (mi.Color3f(rgba.x, rgba.y, rgba.z) for rgba in (rendered, target))
         ray = self._views.pixel_rays(view)
         found = self._scene.ray_intersect_preliminary(ray, coherent=True)

@@ -70,7 +70,11 @@ class JointStage:
         self.parameters = mi.traverse(self.scene)
         #: Per view, how the light has turned; none if it stays.
         self._turns = turns_with_camera(fit.sensors) if light and config.light_frame == "camera" else []
-        self._targets = [mi.TensorXf(target.rgba) for target in fit.targets]
+        #: Per view the share of each pixel that is known, None if that is all. The rest is black in images.
+        self._known = [None if target.known.all() else mi.TensorXf(target.known[..., None])
+                       for target in fit.targets]
+        self._targets = [mi.TensorXf(target.rgba if known is None else target.rgba * target.known[..., None])
+                         for target, known in zip(fit.targets, self._known, strict=True)]
         self._sees_masks = all(target.has_alpha for target in fit.targets) and not config.geometry_only
         if config.geometry_only:
             self.subject.shade_flat()
@@ -202,6 +206,8 @@ class JointStage:
             image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[view],
                               integrator=self.integrator, spp=config.primal_spp, spp_grad=config.spp,
                               seed=seed, seed_grad=seed + 1)
+            if (known := self._known[view]) is not None:
+                image = image * known
             compute(image)
         return image
 

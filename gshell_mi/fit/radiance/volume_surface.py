@@ -74,7 +74,7 @@ def volume_surface(volume: RadianceVolume, scene: FitScene, lattice: Lattice,
     subject, views = scene.subject, volume.views
     cell, margin = subject.length_scale * lattice.spacing, _MARGIN
     points = mi.Transform4f(subject.to_world) @ mi.Point3f(lattice.points(mi.Float))
-    alphas = [target.rgba[..., 3] for target in scene.targets]
+    alphas = [target.most_alpha for target in scene.targets]
     distance = visual_hull(points, views, alphas).numpy()
     depths = []
     for index, (target, alpha) in enumerate(zip(scene.targets, alphas, strict=True)):

@@ -98,7 +98,8 @@ class Joint:
         config: its settings.
         iterations: its steps.
         lattice: to work on, unless the surface is on a finer one.
-        refines: whether there is nothing to do on a surface that is as fine already.
+        refines: whether there is nothing to do on a surface that is as fine already, and seen from where the
+            cameras were given.
     """
 
     def __init__(self, name: str, config: JointConfig, iterations: int, lattice: Lattice, *,
@@ -110,7 +111,7 @@ class Joint:
         """The surface with material and light."""
         lattice = self.lattice
         if surface.lattice.resolution >= lattice.resolution:
-            if self.refines:
+            if self.refines and surface.poses is None:
                 return surface
             lattice = surface.on_grid(lattice.grid).lattice
         subject, config = fit.scene.subject, fit.config

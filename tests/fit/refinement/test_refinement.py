@@ -56,16 +56,12 @@ def capture() -> tuple[PinholeViews, PixelPool, list[Target]]:
     return views, PixelPool(views, targets), targets
 
 
-def alphas(targets: list[Target]) -> list[np.ndarray]:
-    return [target.rgba[..., 3] for target in targets]
-
-
 def refinement(capture, vertices, faces, with_outlines) -> PhotometricRefinement:
     views, pixels, targets = capture
     solid = np.ones(len(vertices), bool)
     appearance = SurfaceRadiance(vertices, faces, views, pixels, RADIANCE)
     appearance.refit(solid)
-    outlines = Outlines(views, alphas(targets), faces, solid) if with_outlines else None
+    outlines = Outlines(views, targets, faces, solid) if with_outlines else None
     return PhotometricRefinement(appearance, vertices, faces, outlines, CELL, CONFIG)
 
 
@@ -100,7 +96,7 @@ def test_outline_of_the_true_sphere_is_the_masks(capture):
     def distance(scale: float) -> float:
         vertices = scale * np.array(mesh.vertices)
         appearance = SurfaceRadiance(vertices, faces, views, capture[1], RADIANCE)
-        outlines = Outlines(views, alphas(targets), faces, np.ones(len(vertices), bool))
+        outlines = Outlines(views, targets, faces, np.ones(len(vertices), bool))
         loss = outlines.loss(mi.Float(vertices.ravel()), appearance.scene, np.arange(len(views)))
         return float(np.sqrt(loss[0])) / pixel
 
@@ -109,11 +105,29 @@ def test_outline_of_the_true_sphere_is_the_masks(capture):
     assert distance(1 + 2 * pixel / RADIUS) == pytest.approx(2.0, rel=0.1)
 
 
+def test_outlines_of_what_is_unknown_are_none(capture):
+    views, pixels, targets = capture
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    appearance = SurfaceRadiance(vertices, faces, views, pixels, RADIANCE)
+    cut, ignored = [], []
+    for target in targets:
+        rgba, known = target.rgba.copy(), np.ones(target.rgba.shape[:2], np.float32)
+        # What stands before the sphere hides its edge, by some pixels.
+        rgba[SIZE // 2 + SIZE // 10:], known[SIZE // 2 + SIZE // 10:] = 0, 0
+        cut.append(Target(None, rgba, True))
+        ignored.append(Target(None, rgba, True, known=known))
+    losses = [float(np.sqrt(Outlines(views, each, faces, np.ones(len(vertices), bool)).loss(
+        mi.Float(vertices.ravel()), appearance.scene, np.arange(len(views)))[0])) for each in (cut, ignored)]
+    pixel = 3 * np.linalg.norm(views.bases[0][:, 0]) / SIZE
+    assert losses[0] > 0.5 * pixel and losses[1] < 0.3 * pixel
+
+
 def test_outline_loss_derivative_is_that_of_a_scaled_sphere(capture):
     views, pixels, targets = capture
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=1.05 * RADIUS)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-    outlines = Outlines(views, alphas(targets), faces, np.ones(len(vertices), bool))
+    outlines = Outlines(views, targets, faces, np.ones(len(vertices), bool))
     appearance = SurfaceRadiance(vertices, faces, views, pixels, RADIANCE)
     every = np.arange(len(views))
 

@@ -1,0 +1,91 @@
+"""Small rigid corrections of cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...views import PinholeViews
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Of N cameras.
+
+    Attributes:
+        rotations: (N, 3) rotation vectors about the centres of projection, world axes, radians.
+        shifts: (N, 3) of the centres of projection, world units.
+    """
+
+    rotations: np.ndarray
+    shifts: np.ndarray
+
+    @classmethod
+    def from_array(cls, array: np.ndarray) -> Corrections:
+        """What ``to_array`` gave."""
+        return cls(array[:, :3], array[:, 3:])
+
+    def to_array(self) -> np.ndarray:
+        """(N, 6): rotations and shifts."""
+        return np.concatenate([self.rotations, self.shifts], axis=1)
+
+    def views(self, given: PinholeViews) -> PinholeViews:
+        """The given views, corrected."""
+        turned = Rotation.from_rotvec(self.rotations).as_matrix() @ given.bases
+        return replace(given, origins=given.origins + self.shifts, bases=turned)
+
+    def sensors(self, given: list[mi.Sensor]) -> list[mi.Sensor]:
+        """New sensors like the given ones, corrected; they share the films."""
+        turns = Rotation.from_rotvec(self.rotations).as_matrix()
+        return [_moved(*each) for each in zip(given, turns, self.shifts, strict=True)]
+
+    def as_given(self, views: PinholeViews) -> Corrections:
+        """The same without what all cameras have in common.
+
+        The scene could be turned, moved and scaled together with the cameras, and no image would change. So
+        in the mean they stay as they were given: in orientation, place, and distance from their middle.
+
+        Args:
+            views: as given.
+        """
+        turns, moved = Rotation.from_rotvec(self.rotations), views.origins + self.shifts
+        a, b = moved - moved.mean(axis=0), views.origins - views.origins.mean(axis=0)
+        # Procrustes: orientations and places have the same say (Kabsch 1976).
+        size_a, size_b = (max(float(np.linalg.norm(each)), 1e-12) for each in (a, b))
+        u, _, vt = np.linalg.svd(b.T @ a / (size_a * size_b) + turns.as_matrix().mean(axis=0).T)
+        turn = Rotation.from_matrix(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)
+        moved = size_b / size_a * turn.apply(a) + views.origins.mean(axis=0)
+        return Corrections((turn * turns).as_rotvec(), moved - views.origins)
+
+    def in_pixels(self, views: PinholeViews, points: np.ndarray) -> np.ndarray:
+        """(N,) mean distances by which points (P, 3) move in the images.
+
+        Args:
+            views: as given.
+            points: of the surface, world units.
+        """
+        before, after = (_projected(each, points) for each in (views, self.views(views)))
+        return np.linalg.norm(after - before, axis=2).mean(axis=1)
+
+
+def _projected(views: PinholeViews, points: np.ndarray) -> np.ndarray:
+    """(N, P, 2) positions in pixels."""
+    scaled = np.einsum("nij,npj->npi", np.linalg.inv(views.bases), points - views.origins[:, None])
+    return scaled[..., :2] / scaled[..., 2:] * views.sizes[:, None]
+
+
+def _moved(sensor: mi.Sensor, turn: np.ndarray, shift: np.ndarray) -> mi.Sensor:
+    parameters = mi.traverse(sensor)
+    optics = ("principal_point_offset_x", "principal_point_offset_y", "near_clip", "far_clip",
+              "aperture_radius", "focus_distance")
+    to_world = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    to_world[:3, :3] = turn @ to_world[:3, :3]
+    to_world[:3, 3] += shift
+    return mi.load_dict({
+        "type": "thinlens" if "aperture_radius" in parameters else "perspective", "id": sensor.id(),
+        "fov": float(parameters["x_fov"][0]), "fov_axis": "x", "to_world": mi.ScalarTransform4f(to_world),
+        **{name: float(np.ravel(parameters[name])[0]) for name in optics if name in parameters},
+        "film": sensor.film(), "sampler": sensor.sampler()})

@@ -1,0 +1,145 @@
+"""Cameras around a textured potato: found where they are wrong, left alone where they are right."""
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from gshell_mi.compat import mesh_scene
+from gshell_mi.fit.poses.alignment import Alignment
+from gshell_mi.fit.poses.corrections import Corrections
+from gshell_mi.fit.poses.evidence import Outline, Texture
+from gshell_mi.targets import Target
+from gshell_mi.views import PinholeViews
+
+VIEWS, SIZE, OVER, DISTANCE = 14, 128, 3, 3.0
+
+
+def potato() -> tuple[np.ndarray, np.ndarray]:
+    ball = trimesh.creation.icosphere(5)
+    points = np.array(ball.vertices)
+    bumps = 1 + 0.1 * np.sin(4 * points[:, 0] + 1) + 0.1 * np.cos(5 * points[:, 1] - 2 * points[:, 2])
+    return points * bumps[:, None] * [0.7, 0.5, 0.6], np.array(ball.faces)
+
+
+def texture(points: np.ndarray) -> np.ndarray:
+    """(P,) reflectance with structure some pixels wide."""
+    waves = np.random.default_rng(3).normal(0, 14, (24, 3))
+    return 0.4 + 0.06 * np.cos(points @ waves.T + np.arange(24)).sum(axis=1)
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return potato()
+
+
+@pytest.fixture(scope="module")
+def views() -> PinholeViews:
+    rng, sensors = np.random.default_rng(0), []
+    for index in range(VIEWS):
+        origin = rng.normal(size=3)
+        origin *= DISTANCE / np.linalg.norm(origin)
+        sensors.append(mi.load_dict({
+            "type": "perspective", "id": f"view_{index:03}", "fov": 32.0,
+            "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 1, 0.1]),
+            "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE}}))
+    return PinholeViews.from_sensors(sensors)
+
+
+def photograph(mesh, views: PinholeViews, *, textured: bool = True) -> list[Target]:
+    """What exact cameras see, antialiased."""
+    scene, targets = mesh_scene(*mesh), []
+    for view in range(len(views)):
+        row, column = np.mgrid[:SIZE * OVER, :SIZE * OVER].reshape(2, -1)
+        film = (np.stack([column, row]) + 0.5) / (SIZE * OVER)
+        index = mi.UInt32(np.full(film.shape[1], view, np.uint32))
+        ray = views.rays(index, mi.Point2f(film.astype(np.float32)))
+        hit = scene.ray_intersect(ray)
+        valid, points = hit.is_valid().numpy(), hit.p.numpy().T
+        color = np.where(valid, texture(points) if textured else 0.4, 0)
+        rgba = np.stack([color] * 3 + [valid.astype(float)], axis=1)
+        rgba = rgba.reshape(SIZE, OVER, SIZE, OVER, 4).mean(axis=(1, 3)).astype(np.float32)
+        targets.append(Target(Path(f"view_{view:03}.exr"), rgba, True))
+    return targets
+
+
+@pytest.fixture(scope="module")
+def targets(mesh, views):
+    return photograph(mesh, views)
+
+
+def wrong(views: PinholeViews, degrees: float) -> PinholeViews:
+    """Cameras that are off by so much, and by as much of the distance as parts of a radian."""
+    rng = np.random.default_rng(5)
+    size = np.radians(degrees) / np.sqrt(3)
+    change = Corrections(size * rng.normal(size=(VIEWS, 3)), DISTANCE * size * rng.normal(size=(VIEWS, 3)))
+    return change.views(views)
+
+
+def aligned(mesh, targets, given: PinholeViews, *, textures: bool = True):
+    """The alignment after three steps for each of two blurs, and the verdict before."""
+    alignment, verdict = Alignment(given, DISTANCE), None
+    texture_of, outline = Texture(mesh, targets, 6000, 0.02, 0), Outline(mesh, targets)
+    for blur in (2.0, 1.0):
+        compare = texture_of.level(blur, alignment.views)
+        for _ in range(3):
+            kinds = [compare(alignment.views)] if textures else []
+            kinds += [outline.evidence(alignment.views)]
+            verdict = verdict or alignment.verdict(kinds)
+            alignment.step(kinds)
+    return alignment, verdict
+
+
+def error(mesh, views: PinholeViews, found: PinholeViews) -> float:
+    """Median of the errors in pixels, but for what all cameras have in common."""
+    turns = Rotation.from_matrix(found.bases @ np.linalg.inv(views.bases))
+    left = Corrections(turns.as_rotvec(), found.origins - views.origins).as_given(views)
+    return float(np.median(left.in_pixels(views, mesh[0][::50])))
+
+
+@pytest.mark.parametrize("textures", [True, False])
+def test_wrong_cameras_are_corrected(mesh, views, targets, textures):
+    given = wrong(views, 0.5)
+    assert error(mesh, views, given) > 0.9
+    alignment, verdict = aligned(mesh, targets, given, textures=textures)
+    assert verdict.accepted[0]
+    assert error(mesh, views, alignment.views) < 0.35
+
+
+def test_cameras_stay_where_they_were_given_in_the_mean(mesh, views, targets):
+    alignment, _ = aligned(mesh, targets, wrong(views, 0.5))
+    again = alignment.corrections.as_given(alignment.given)
+    np.testing.assert_allclose(again.to_array(), alignment.corrections.to_array(), atol=1e-9)
+
+
+def test_exact_cameras_stay(mesh, views, targets):
+    alignment, _ = aligned(mesh, targets, views)
+    assert np.median(alignment.corrections.in_pixels(views, mesh[0][::50])) < 0.05
+
+
+def test_without_texture_the_outline_tells(mesh, views):
+    plain, given = photograph(mesh, views, textured=False), wrong(views, 0.5)
+    alignment, verdict = aligned(mesh, plain, given)
+    assert verdict.accepted[0] and error(mesh, views, alignment.views) < 0.355 * error(mesh, views, given)
+
+
+def test_what_is_unknown_tells_nothing(mesh, views, targets):
+    """Half of each image is unknown, and wrong: it makes no difference."""
+    spoilt = []
+    for target in targets:
+        rgba, known = target.rgba.copy(), np.ones((SIZE, SIZE), np.float32)
+        rgba[:, :SIZE // 2], known[:, :SIZE // 2] = [0.9, 0.1, 0.9, 1.0], 0
+        spoilt.append(Target(target.path, rgba, True, known=known))
+    given = wrong(views, 0.5)
+    alignment, _ = aligned(mesh, spoilt, given)
+    assert error(mesh, views, alignment.views) < 0.4 * error(mesh, views, given)
+
+
+def test_nothing_seen_changes_nothing(mesh, views):
+    empty = [Target(Path(f"{name}.exr"), np.zeros((SIZE, SIZE, 4), np.float32), True) for name in views.ids]
+    alignment, verdict = aligned(mesh, empty, views)
+    assert not verdict.accepted[0]
+    np.testing.assert_allclose(alignment.corrections.to_array(), 0, atol=1e-9)

@@ -1,0 +1,155 @@
+"""Poses of the bowl: corrected where they are wrong, kept where they are right or told to be, and told of."""
+
+import dataclasses
+import json
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bowl import CLOSED, RADIUS, SHORT
+from scipy.spatial.transform import Rotation
+
+from gshell_mi.export.stock_scene import write_scene
+from gshell_mi.fit import FitConfig
+from gshell_mi.fit.__main__ import main
+from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+from gshell_mi.fit.lattices import Lattices
+from gshell_mi.fit.poses.corrections import Corrections
+from gshell_mi.fit.stage import Fit
+from gshell_mi.fit.stages.poses import Poses
+from gshell_mi.fit.surface import Surface
+from gshell_mi.scene import load_fit_scene
+from gshell_mi.scene_files import load_scene
+from gshell_mi.views import PinholeViews
+
+
+class Silent:
+    """Steps of which only the facts are kept."""
+
+    def __init__(self):
+        self.facts = {}
+
+    @contextmanager
+    def task(self, name="", total=None):
+        yield lambda: None
+
+    def fact(self, name, value):
+        self.facts[name] = value
+
+
+@pytest.fixture(scope="module")
+def exact(bowl_scene) -> Fit:
+    scene, config = load_fit_scene(bowl_scene), FitConfig()
+    return Fit(scene, config, Lattices.of(scene.subject, config))
+
+
+@pytest.fixture(scope="module")
+def bowl(exact) -> Surface:
+    """As it is."""
+    fields, scale = exact.scene.subject.fields(), exact.scene.subject.length_scale
+    points = fields.lattice.vertex_positions()
+    distance = np.linalg.norm(points, axis=1) - RADIUS / scale
+    return Surface(fields).with_fields(sdf=distance.astype(np.float32),
+                                       msdf=(-points[:, 1]).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def errors(exact) -> Corrections:
+    """Two degrees: a pixel of these small images is 0.7."""
+    rng, count = np.random.default_rng(2), len(exact.views)
+    return Corrections(np.radians(2) * rng.normal(size=(count, 3)) / np.sqrt(3), np.zeros((count, 3)))
+
+
+@pytest.fixture(scope="module")
+def wrong(exact, errors) -> Fit:
+    """The same images, taken for those of cameras that are wrong."""
+    scene = dataclasses.replace(exact.scene, sensors=errors.sensors(exact.scene.sensors))
+    return Fit(scene, exact.config, exact.lattices)
+
+
+def left(found: PinholeViews, exact: PinholeViews) -> np.ndarray:
+    """(N,) errors in pixels, but for what all cameras have in common."""
+    turns = Rotation.from_matrix(found.bases @ np.linalg.inv(exact.bases))
+    change = Corrections(turns.as_rotvec(), found.origins - exact.origins).as_given(exact)
+    return change.in_pixels(exact, 0.5 * np.random.default_rng(0).normal(size=(50, 3)))
+
+
+def test_wrong_poses_are_corrected(exact, wrong, bowl):
+    steps = Silent()
+    found = Poses(exact.config.cameras).run(wrong, bowl, steps)
+    assert steps.facts["poses_kept"] and found.fields is bowl.fields
+    corrected = wrong.corrected(found)
+    assert corrected.scene.targets == wrong.scene.targets
+    assert np.median(left(corrected.views, exact.views)) < 0.4 * np.median(left(wrong.views, exact.views))
+    told = steps.facts["poses"]
+    assert list(told["views"]) == list(exact.views.ids)
+    assert told["median_pixels"] == pytest.approx(steps.facts["poses_verdict"]["pixels"], abs=1e-3)
+    assert all(view["degrees"] < 10 for view in told["views"].values())
+
+
+def test_exact_poses_stay(exact, bowl):
+    steps = Silent()
+    assert Poses(exact.config.cameras).run(exact, bowl, steps) is bowl
+    assert steps.facts["poses_kept"] is False and "poses" not in steps.facts
+
+
+def test_without_masks_poses_stay(exact, wrong, bowl):
+    bare = [dataclasses.replace(target, has_alpha=False) for target in wrong.scene.targets]
+    fit = Fit(dataclasses.replace(wrong.scene, targets=bare), wrong.config, wrong.lattices)
+    assert Poses(exact.config.cameras).run(fit, bowl, Silent()) is bowl
+
+
+def test_a_surface_keeps_poses(bowl, errors):
+    surface = dataclasses.replace(bowl, poses=errors.to_array())
+    np.testing.assert_array_equal(Surface.from_arrays(surface.to_arrays()).poses, surface.poses)
+
+
+#: Hardly any steps.
+QUICK = (*SHORT, *CLOSED, "--iterations", "2", "--cavities.iterations", "0", "--refinement.iterations", "0",
+         "--detail.iterations", "2", "--exposures", "keep")
+
+
+def test_a_fit_exports_the_cameras_that_it_found(bowl_scene, exact, wrong, tmp_path, monkeypatch):
+    """And a fit that is resumed after they were found goes on with them."""
+    given = tmp_path / "given.xml"
+    text = bowl_scene.read_text()
+    start, end = text.index("<sensor"), text.rindex("</sensor>") + len("</sensor>")
+    write_scene(tmp_path / "sensors.xml", exact.scene.light, wrong.scene.sensors)
+    moved = (tmp_path / "sensors.xml").read_text()
+    moved = moved[moved.index("<sensor"):moved.rindex("</sensor>") + len("</sensor>")]
+    given.write_text(text[:start] + moved + text[end:])
+    output, targets = tmp_path / "out", str(bowl_scene.with_suffix(""))
+    command = [str(given), "--targets", targets, "-o", str(output), "--quiet", *QUICK]
+    corrections = Corrections(np.full((len(exact.views), 3), [0, 0.01, 0]), np.zeros((len(exact.views), 3)))
+    corrections.rotations[::2] *= -1
+
+    def found(self, fit, surface, steps):
+        return dataclasses.replace(surface, poses=corrections.to_array())
+
+    def interrupted(self, fit, surface, steps):
+        raise KeyboardInterrupt
+
+    from gshell_mi.fit.stages.texture import Texture
+    monkeypatch.setattr(Poses, "run", found)
+    with monkeypatch.context() as patch:
+        patch.setattr(Texture, "run", interrupted)
+        assert main([*command, "--texture.rounds", "1"]) == 130
+    assert Checkpoint.load(output / "checkpoint.npz").arrays["poses"].shape == (len(exact.views), 6)
+    seen, run = [], Texture.run
+
+    def watched(self, fit, surface, steps):
+        seen.append(fit.views)
+        return run(self, fit, surface, steps)
+
+    monkeypatch.setattr(Texture, "run", watched)
+    assert main([*command, "--texture.rounds", "1", "--resume"]) == 0
+    expected = corrections.views(PinholeViews.from_sensors(load_fit_scene(given, Path(targets)).sensors))
+    for views in (seen[0], PinholeViews.from_sensors(load_scene(output / "scene.xml").sensors())):
+        np.testing.assert_allclose(views.bases, expected.bases, atol=1e-5)
+
+
+def test_kept_poses(bowl_scene, tmp_path):
+    assert main([str(bowl_scene), "-o", str(tmp_path / "out"), "--quiet", *QUICK, "--poses", "keep"]) == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert "poses" not in metrics and "poses_kept" not in metrics
