@@ -71,10 +71,10 @@ class JointStage:
         #: Per view, how the light has turned; none if it stays.
         self._turns = turns_with_camera(fit.sensors) if light and config.light_frame == "camera" else []
         #: Per view the share of each pixel that is known, None if that is all. The rest is black in images.
-        self._known = [None if target.known.all() else mi.TensorXf(target.known[..., None])
-                       for target in fit.targets]
-        self._targets = [mi.TensorXf(target.rgba if known is None else target.rgba * target.known[..., None])
-                         for target, known in zip(fit.targets, self._known, strict=True)]
+        known = [np.asarray(target.known)[..., None] for target in fit.targets]
+        self._known = [None if share.all() else mi.TensorXf(share) for share in known]
+        self._targets = [mi.TensorXf(target.rgba if share.all() else target.rgba * share)
+                         for target, share in zip(fit.targets, known, strict=True)]
         self._sees_masks = all(target.has_alpha for target in fit.targets) and not config.geometry_only
         if config.geometry_only:
             self.subject.shade_flat()

@@ -73,7 +73,7 @@ class Texture:
                  seed: int):
         vertices, faces = mesh
         surface = trimesh.Trimesh(vertices, faces, process=False)
-        self.points, face = trimesh.sample.sample_surface(surface, count, seed=seed)
+        self.points, face = trimesh.sample.sample_surface(surface, count, seed=seed)[:2]
         weights = trimesh.triangles.points_to_barycentric(surface.triangles[face], self.points)
         self._normals = unit(np.einsum("ij,ijk->ik", weights, surface.vertex_normals[faces[face]]))
         self._scene, self._cell, self._targets = mesh_scene(vertices, faces), cell, targets
