@@ -42,6 +42,10 @@ class Target:
         """(height, width) the largest coverage that what is known allows."""
         return np.maximum(self.rgba[..., 3], 1 - np.asarray(self.known))
 
+    def ignoring(self, pixels: np.ndarray) -> Target:
+        """The same with (height, width) some pixels unknown."""
+        return replace(self, known=np.where(pixels, np.float32(0), np.asarray(self.known)))
+
     def divided(self, gain: np.ndarray) -> Target:
         """The same with its channels divided by (3,) gains; alpha stays.
 

@@ -11,6 +11,9 @@ from scipy.sparse.csgraph import connected_components
 #: A boundary loop shorter than this fraction of the bounding box's diagonal is a pin-hole.
 PINHOLE = 0.05
 
+#: Lobes are parted where they are at most twice this many vertices wide.
+_NECK = 2
+
 
 @dataclass(frozen=True)
 class Topology:
@@ -134,3 +137,23 @@ def equal_patches(labels: np.ndarray, faces: np.ndarray) -> np.ndarray:
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     same = labels[edges[:, 0]] == labels[edges[:, 1]]
     return vertex_components(edges[same], len(labels))[1]
+
+
+def lobes(chosen: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V,) ids of the connected patches of chosen and of other vertices, those that are chosen split at their
+    necks."""
+    edges, _ = mesh_edges(faces)
+    here, there = np.concatenate([edges, edges[:, ::-1]]).T
+    core = chosen
+    for _ in range(_NECK):
+        core = ~spread(~core, edges)
+    patch = equal_patches(chosen, faces)
+    # Patches without a core are whole.
+    core = core | chosen & (np.bincount(patch, core) == 0)[patch]
+    lobe = np.where(core, 1 + vertex_components(edges[core[edges].all(axis=1)], len(chosen))[1], 0)
+    while True:
+        front = (lobe[here] == 0) & (lobe[there] > 0) & chosen[here]
+        if not front.any():
+            break
+        np.maximum.at(lobe, here[front], lobe[there[front]])
+    return np.where(chosen, lobe, 1 + len(chosen) + patch)

@@ -16,6 +16,7 @@ SHORT = ("--openings.iterations", "100", "--radiance.batch", "16384", "--radianc
          "--cavities.iterations", "10", "--cavities.batch", "4096", "--volume.iterations", "0",
          "--refinement.iterations", "8", "--folds.iterations", "0", "--iterations", "12",
          "--render.spp", "2", "--render.primal-spp", "4", "--render.max-depth", "2", "--texture.rounds", "0",
+         "--occlusion.most", "0",
          "--model.light-height", "8", "--no-report")
 
 #: Added to these where openings do not matter: hardly any steps, and the template stays closed.

@@ -14,7 +14,8 @@ from .mask_outline import mask_distance, sharp
 
 
 def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray], *,
-                daylight_votes: float = 0.06, progress: Callable[[], object] | None = None) -> mi.Float:
+                daylight_votes: float = 0.06, disbelieved: int = 0,
+                progress: Callable[[], object] | None = None) -> mi.Float:
     """Signed distance to the visual hull at ``points``, negative inside.
 
     Each view bounds the object by the cone over its mask; the hull is their intersection, the
@@ -27,6 +28,7 @@ def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray
         views: the cameras.
         alphas: per view, (height, width) coverage.
         daylight_votes: fraction of the views that have to see daylight at a point (at least 2 do).
+        disbelieved: masks that are not believed at a point: those that it is farthest outside of.
         progress: called without arguments after each view.
 
     Returns:
@@ -36,9 +38,10 @@ def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray
     """
     thin_parts = sharp(alphas)
     votes = max(2, round(daylight_votes * len(views)))
-    carved = dr.full(mi.Float, -dr.inf, dr.width(points))
-    # The largest distances to the unfilled masks, sorted: the last one has `votes` supporters.
-    daylight = [dr.full(mi.Float, -dr.inf, dr.width(points)) for _ in range(votes)]
+    # The largest distances to the filled masks, and to the unfilled ones, sorted: the last one has as many
+    # supporters as there are.
+    carved, daylight = ([dr.full(mi.Float, -dr.inf, dr.width(points)) for _ in range(count)]
+                        for count in (1 + disbelieved, votes))
     for index, alpha in enumerate(alphas):
         whole = not _touches_border(alpha)
         outline = mask_distance(alpha, thin_parts=thin_parts)
@@ -46,13 +49,13 @@ def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray
         if _has_holes(alpha):
             outline = mask_distance(alpha, fill_holes=False, thin_parts=thin_parts)
             plain = _cone_distance(points, views, index, outline, whole)
-        carved = dr.maximum(carved, filled)
-        for rank in range(votes):
-            daylight[rank], plain = dr.maximum(daylight[rank], plain), dr.minimum(daylight[rank], plain)
+        for largest, value in ((carved, filled), (daylight, plain)):
+            for rank, other in enumerate(largest):
+                largest[rank], value = dr.maximum(other, value), dr.minimum(other, value)
         dr.eval(carved, daylight)
         if progress:
             progress()
-    distance = dr.maximum(carved, daylight[-1])
+    distance = dr.maximum(carved[-1], daylight[-1])
     return dr.select(distance == -dr.inf, dr.inf, distance)
 
 

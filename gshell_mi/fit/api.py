@@ -157,7 +157,7 @@ def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report:
     """Writes what a fit has found; returns the metrics."""
     output, progress, checkpoint = runner.output, runner.progress, runner.checkpoint
     with progress.stage("export", None), runner.timed("export"):
-        fit = fit.posed(surface)
+        fit = fit.corrected(dataclasses.replace(surface, gains=None))
         fitted = Fitted.of(fit, surface)
         metrics = export_fit(output, fit.scene, fitted.material, fitted.light, fit.config.triptychs,
                              fitted.texture, fitted.texture_levels,

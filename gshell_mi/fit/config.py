@@ -15,6 +15,7 @@ from .stages.cavities import CavitiesConfig
 from .stages.exposures import GainsConfig
 from .stages.hull import HullConfig
 from .stages.joint import DetailConfig, JointConfig
+from .stages.occlusion import OcclusionConfig
 from .stages.openings import OpeningsConfig
 from .stages.poses import CamerasConfig
 from .stages.refinement import FoldsConfig, RefinementConfig
@@ -78,6 +79,8 @@ class FitConfig:
     checkpoint_seconds: float = 10.0
     """Seconds between checkpoints: what a kill loses at most."""
 
+    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
+    """Pixels whose masks deny what others see."""
     hull: HullConfig = field(default_factory=HullConfig)
     """The visual hull."""
     radiance: RadianceConfig = field(default_factory=RadianceConfig)
@@ -159,7 +162,7 @@ Effort = Literal["preview", "normal", "thorough"]
 
 #: Less of everything, but for the steps that openings need: a rough result in half a minute.
 _PREVIEW = {"resolution": 48, "iterations": 70, "triptychs": 4, "radiance.batch": 16384,
-            "openings.iterations": 600, "openings.rounds": 0, "cavities.iterations": 0,
+            "occlusion.most": 0.0, "openings.iterations": 600, "openings.rounds": 0, "cavities.iterations": 0,
             "refinement.iterations": 0, "volume.iterations": 0, "render.views": 1, "render.primal_spp": 4,
             "render.max_depth": 2, "model.even_start": False, "model.light_height": 16, "texture.rounds": 1,
             "joint.color_hold": 0.0, "joint.revision": 1.0}

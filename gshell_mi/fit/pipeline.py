@@ -11,6 +11,7 @@ from .stages.cavities import Cavities
 from .stages.exposures import Exposures
 from .stages.hull import Given, Hull
 from .stages.joint import Joint
+from .stages.occlusion import Occlusion
 from .stages.openings import Openings
 from .stages.poses import Poses
 from .stages.refinement import Refinement
@@ -28,7 +29,10 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
         config: the settings.
     """
     given = bool(scene.subject.filename)
-    start: list[Stage] = [Given() if given else Hull(config.hull)]  # masks, or a file
+    start: list[Stage] = [Given()] if given else [
+        *([Occlusion(config.occlusion)] if config.occlusion.most else []),  # masks that are wrong
+        Hull(config.hull),                                              # what the masks leave
+    ]
     found = config.exposures == "find" and not config.geometry_only
     exposures: list[Stage] = [Exposures(config.gains)] if found else []
     if given and not Given.is_closed(scene, lattices, config):

@@ -68,12 +68,12 @@ class Runner:
             raise UserError(f"The checkpoint '{self._path}' is in the stage '{checkpoint.stage}', which this "
                             f"fit has not; start without --resume.")
         self._rewind_log(names)
-        seen, gains, poses = fit, None, None
+        seen, told = fit, Surface(surface.fields)
         for stage, following in zip(stages, names[1:], strict=True):
             if stage.name == checkpoint.stage:
-                if surface.gains is not gains or surface.poses is not poses:
-                    seen, gains, poses = fit.corrected(surface), surface.gains, surface.poses
-                surface = stage.run(seen, surface, Steps(self, stage.name, surface))
+                if not surface.tells_the_same(told):
+                    seen, told = fit.corrected(surface), surface
+                surface = stage.run(seen, surface, Steps(self, stage.name, surface)).after(surface)
                 checkpoint.stage, checkpoint.iteration, checkpoint.arrays = following, 0, surface.to_arrays()
                 self.save()
                 # Sizes that this stage needed are not those of the next.

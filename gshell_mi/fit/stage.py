@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
-import mitsuba as mi
 import numpy as np
 
+from ..packed_pixels import unpacked
 from ..pixels import PixelPool
 from ..scene import FitScene
 from ..views import PinholeViews
@@ -35,13 +35,11 @@ class Fit:
         scene: with its targets. Only the joint stage changes its shape.
         config: the settings.
         lattices: that stages work on.
-        gains: (N, 3) that the scene's targets have been divided by; None if they are as given.
     """
 
     scene: FitScene
     config: FitConfig
     lattices: Lattices
-    gains: np.ndarray | None = None
 
     @cached_property
     def views(self) -> PinholeViews:
@@ -85,30 +83,26 @@ class Fit:
         return np.setdiff1d(every, held_out) if len(every) > 1 else every, held_out
 
     def corrected(self, surface: Surface) -> Fit:
-        """The same with targets as if all views were exposed alike, and cameras where the surface says.
+        """The same with what was found of the views: targets as if all were exposed alike, without what is
+        ignored, and cameras where they are.
 
         The pools of this one are let go, and made again if they are asked for: two of each would be as large
         as the targets many times over.
 
         Args:
-            surface: that the gains and the corrections are of; of a fit as it was given.
+            surface: that tells; of a fit as it was given.
         """
         for pool in ("pixels", "training", "judge", "held_out_judge"):
             self.__dict__.pop(pool, None)
-        gains, targets = surface.gains, self.scene.targets
-        if gains is not None:
-            targets = [target.divided(gain) for target, gain in zip(targets, gains, strict=True)]
-        scene = replace(self.scene, sensors=self._posed_sensors(surface), targets=targets)
-        return replace(self, scene=scene, gains=gains)
-
-    def posed(self, surface: Surface) -> Fit:
-        """The same with cameras where the surface says, and targets as they were given."""
-        return replace(self, scene=replace(self.scene, sensors=self._posed_sensors(surface)))
-
-    def _posed_sensors(self, surface: Surface) -> list[mi.Sensor]:
-        """The sensors where the surface says; of a fit as it was given."""
-        sensors = self.scene.sensors
-        return sensors if surface.poses is None else Corrections.from_array(surface.poses).sensors(sensors)
+        targets, sensors = self.scene.targets, self.scene.sensors
+        if surface.gains is not None:
+            targets = [target.divided(gain) for target, gain in zip(targets, surface.gains, strict=True)]
+        if surface.ignored is not None:
+            targets = [target.ignoring(pixels) for target, pixels in zip(
+                targets, unpacked(surface.ignored, self.views.sizes), strict=True)]
+        if surface.poses is not None:
+            sensors = Corrections.from_array(surface.poses).sensors(sensors)
+        return replace(self, scene=replace(self.scene, sensors=sensors, targets=targets))
 
     def cell(self, surface: Surface) -> float:
         """Side of a cell of a surface's lattice in world units."""

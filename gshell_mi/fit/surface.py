@@ -16,6 +16,9 @@ TYPICAL_REFLECTANCE = 0.5
 #: Lattice fields that are always there, and those that some surfaces have.
 _FIELDS, _OPTIONAL = ("sdf", "msdf", "deform"), ("weights", "blocks")
 
+#: What is found of the views.
+_OF_VIEWS = "gains", "ignored", "poses"
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -61,6 +64,7 @@ class Surface:
         model: material, light and texture that later stages have left, flat arrays by name.
         revision: what a topology revision has changed, for the stages after it; flat arrays by name.
         gains: (N, 3) what each view's channels are multiplied by, as it was exposed; None if by nothing.
+        ignored: pixels that tell nothing, of all views one after the other, eight to a byte; None for none.
         poses: (N, 6) corrections of the cameras, as of ``Corrections``; None if they are as given.
     """
 
@@ -71,6 +75,7 @@ class Surface:
     model: Mapping[str, np.ndarray] = field(default_factory=dict)
     revision: Mapping[str, np.ndarray] = field(default_factory=dict)
     gains: np.ndarray | None = None
+    ignored: np.ndarray | None = None
     poses: np.ndarray | None = None
 
     @property
@@ -82,6 +87,15 @@ class Surface:
         """The same values at the same vertices, drawn with another kind of cells."""
         return replace(self, fields=replace(self.fields, grid=grid))
 
+    def tells_the_same(self, other: Surface) -> bool:
+        """Whether the same was found of the views."""
+        return all(getattr(self, name) is getattr(other, name) for name in _OF_VIEWS)
+
+    def after(self, before: Surface) -> Surface:
+        """The same, with what was found of the views before unless that has changed."""
+        return replace(self, **{name: getattr(before, name) for name in _OF_VIEWS
+                                if getattr(self, name) is None})
+
     def with_fields(self, **fields: np.ndarray) -> Surface:
         """The surface with some of its lattice fields replaced."""
         return replace(self, fields=replace(self.fields, **fields))
@@ -91,7 +105,7 @@ class Surface:
         arrays = {"grid": np.array(GRIDS.index(self.fields.grid)),
                   "block_resolution": np.array(self.fields.block_resolution)}
         optional = {name: getattr(self.fields, name) for name in (*_FIELDS, *_OPTIONAL)}
-        optional |= {"hull": self.hull, "gains": self.gains, "poses": self.poses}
+        optional |= {"hull": self.hull} | {name: getattr(self, name) for name in _OF_VIEWS}
         arrays |= {name: array for name, array in optional.items() if array is not None}
         if self.seen:
             arrays |= {name: getattr(self.seen, name) for name in ("radiance", "known", "light")}
@@ -116,7 +130,7 @@ class Surface:
         stages = sorted({tuple(name.split(" ")[1:3]) for name in arrays if name.startswith("moved ")})
         moved = [_moved(stage, _under(arrays, f"moved {index} {stage} ")) for index, stage in stages]
         return cls(fields, arrays.get("hull"), seen, tuple(moved), _under(arrays, "model "),
-                   _under(arrays, "revision "), arrays.get("gains"), arrays.get("poses"))
+                   _under(arrays, "revision "), **{name: arrays.get(name) for name in _OF_VIEWS})
 
 
 def _moved(stage: str, arrays: Mapping[str, np.ndarray]) -> Moved:

@@ -137,3 +137,15 @@ def test_what_no_view_frames_is_outside():
     points = mi.Point3f([0, 0, 0], [0, 2, 0], [0, 0, 4])  # in the frame, above it, behind the camera
     distance = visual_hull(points, views, [np.ones((16, 16))]).numpy()
     assert distance[0] < 0 and (distance[1:] == np.inf).all()
+
+
+def test_masks_that_are_not_believed():
+    """Points are as far from the hull as the mask is that is next in distance."""
+    views = around(9)
+    masks = [coverage(views, index, sphere_hit(0.5)) for index in range(9)]
+    points = mi.Point3f([0.0, 0.3, 0.7], [0.0, 0.1, 0.0], [0.0, -0.2, 0.0])
+    expected = visual_hull(points, views, masks).numpy()
+    masks[4] = np.zeros_like(masks[4])
+    assert visual_hull(points, views, masks).numpy().min() > 0
+    # All points are farthest outside of the empty mask, so the next one tells.
+    np.testing.assert_allclose(visual_hull(points, views, masks, disbelieved=1).numpy(), expected, atol=1e-6)

@@ -26,16 +26,20 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
 
 
 @pytest.mark.parametrize(("settings", "expected"), [
-    ({}, ["hull", *START, "volume", "joint", "poses", "detail", "texture"]),
-    ({"volume.iterations": 0}, ["hull", *START, "joint", "poses", "detail", "texture"]),
-    ({"iterations": 0}, ["hull", *START, "volume", "joint"]),
-    ({"detail.iterations": 0}, ["hull", *START, "volume", "joint", "texture"]),
-    ({"model.field": "hashgrid"}, ["hull", *START, "volume", "joint", "texture"]),
-    ({"exposures": "keep"}, ["hull", *KEPT, "volume", "joint", "poses", "detail", "texture"]),
-    ({"geometry_only": True}, ["hull", *KEPT, "volume", "joint", "poses", "detail", "texture"]),
-    ({"poses": "keep"}, ["hull", *START, "volume", "joint", "detail", "texture"]),
-    ({"texture.rounds": 0}, ["hull", *START, "volume", "joint", "poses", "detail"]),
-    ({"model.field": "flexicubes"}, ["hull", *START, "volume", "joint", "poses", "detail", "texture"]),
+    ({}, ["occlusion", "hull", *START, "volume", "joint", "poses", "detail", "texture"]),
+    ({"volume.iterations": 0}, ["occlusion", "hull", *START, "joint", "poses", "detail", "texture"]),
+    ({"iterations": 0}, ["occlusion", "hull", *START, "volume", "joint"]),
+    ({"detail.iterations": 0}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
+    ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
+    ({"exposures": "keep"},
+     ["occlusion", "hull", *KEPT, "volume", "joint", "poses", "detail", "texture"]),
+    ({"geometry_only": True},
+     ["occlusion", "hull", *KEPT, "volume", "joint", "poses", "detail", "texture"]),
+    ({"occlusion.most": 0.0}, ["hull", *START, "volume", "joint", "poses", "detail", "texture"]),
+    ({"poses": "keep"}, ["occlusion", "hull", *START, "volume", "joint", "detail", "texture"]),
+    ({"texture.rounds": 0}, ["occlusion", "hull", *START, "volume", "joint", "poses", "detail"]),
+    ({"model.field": "flexicubes"},
+     ["occlusion", "hull", *START, "volume", "joint", "poses", "detail", "texture"]),
 ])
 def test_stages_from_masks(settings, expected):
     assert names(mi.load_dict({"type": "gshell", "resolution": 12}), settings) == expected

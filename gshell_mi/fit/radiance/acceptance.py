@@ -6,13 +6,10 @@ import mitsuba as mi
 import numpy as np
 
 from ...fields.smoothing import MeshDiffusion
-from ...topology import equal_patches, mesh_edges, patch_sizes, spread, vertex_components
+from ...topology import equal_patches, lobes, patch_sizes, vertex_components
 from ...triangles import positive_part
 from ..judge import Judge, places_of
 from .shown import Mesh, Shown
-
-#: Openings are parted where they are at most twice this many vertices wide.
-_NECK = 2
 
 #: Rounds in which openings are closed, each time those that are this near to the worst; in the last one all.
 _CLOSINGS, _WORST = 7, 0.5
@@ -74,7 +71,7 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
         return -logits
     kept, trimmed = opened, np.zeros_like(opened)
     for closing in reversed(range(_CLOSINGS)):
-        place = places_of(kept, _lobes(kept, faces))
+        place = places_of(kept, lobes(kept, faces))
         shown = _shown(judge, template, ~kept, logits, closed)
         verdict = judge.compare(closed, shown, (template, place))
         worst = ~verdict.accepted
@@ -140,22 +137,3 @@ def _shown(judge: Judge, template: Mesh, solid: np.ndarray, logits: np.ndarray, 
     vertices, faces = template
     part = positive_part(vertices, faces, np.where(solid, np.abs(logits), -np.abs(logits)))
     return judge.shown(part, like=closed)
-
-
-def _lobes(opened: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V,) ids of the connected patches of equal label, those that are open split at their necks."""
-    edges, _ = mesh_edges(faces)
-    here, there = np.concatenate([edges, edges[:, ::-1]]).T
-    core = opened
-    for _ in range(_NECK):
-        core = ~spread(~core, edges)
-    patch = equal_patches(opened, faces)
-    # Patches without a core are whole.
-    core = core | opened & (np.bincount(patch, core) == 0)[patch]
-    lobe = np.where(core, 1 + vertex_components(edges[core[edges].all(axis=1)], len(opened))[1], 0)
-    while True:
-        front = (lobe[here] == 0) & (lobe[there] > 0) & opened[here]
-        if not front.any():
-            break
-        np.maximum.at(lobe, here[front], lobe[there[front]])
-    return np.where(opened, lobe, 1 + len(opened) + patch)

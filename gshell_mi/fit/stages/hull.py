@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -49,24 +50,36 @@ class Hull:
         Raises:
             UserError: the masks have nothing in common.
         """
-        subject, lattice = fit.scene.subject, fit.lattices.early
         with steps.task(total=len(fit.views)) as advance:
-            finer = thin_part_refinement(lattice.resolution)
-            samples = CubeLattice(finer * lattice.resolution)
-            points = mi.Transform4f(subject.to_world) @ mi.Point3f(samples.points(mi.Float))
-            world = visual_hull(points, fit.views, fit.alphas, daylight_votes=self.config.daylight_votes,
-                                progress=advance)
-            cell = lattice.spacing
-            solid = np.clip(world.numpy() / subject.length_scale, -1, 1) / cell
-            grown = thickened(solid.reshape((samples.stride,) * 3), finer)
-            vertices = lattice.points(mi.Float)
-            sdf, hull = (closed_at_border(Interpolation(mi.Float(cell * field.ravel()), samples)(vertices)
-                                          .numpy(), lattice) for field in (grown, solid))
-        if not (sdf < 0).any():
+            hull = hull_of(fit, fit.alphas, progress=advance)
+        if not (hull.fields.sdf < 0).any():
             raise UserError(
                 f"The masks of the targets have no common volume in the box of '{fit.scene.path}'; check "
                 f"the cameras, the alpha of the targets and the gshell shape's to_world.")
-        return Surface(LatticeFields.closed(sdf, lattice.grid), hull=hull)
+        return hull
+
+
+def hull_of(fit: Fit, alphas: list[np.ndarray], *, disbelieved: int = 0,
+            progress: Callable[[], object] | None = None) -> Surface:
+    """The visual hull of some masks on the early lattice, with what is too thin for that grown.
+
+    Args:
+        fit: the views, the lattice and the settings.
+        alphas, disbelieved, progress: as of ``visual_hull``.
+    """
+    subject, lattice = fit.scene.subject, fit.lattices.early
+    finer = thin_part_refinement(lattice.resolution)
+    samples = CubeLattice(finer * lattice.resolution)
+    points = mi.Transform4f(subject.to_world) @ mi.Point3f(samples.points(mi.Float))
+    world = visual_hull(points, fit.views, alphas, daylight_votes=fit.config.hull.daylight_votes,
+                        disbelieved=disbelieved, progress=progress)
+    cell = lattice.spacing
+    solid = np.clip(world.numpy() / subject.length_scale, -1, 1) / cell
+    grown = thickened(solid.reshape((samples.stride,) * 3), finer)
+    vertices = lattice.points(mi.Float)
+    sdf, hull = (closed_at_border(Interpolation(mi.Float(cell * field.ravel()), samples)(vertices).numpy(),
+                                  lattice) for field in (grown, solid))
+    return Surface(LatticeFields.closed(sdf, lattice.grid), hull=hull)
 
 
 class Given:

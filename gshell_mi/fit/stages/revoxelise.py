@@ -70,7 +70,7 @@ def best_revoxelised(fit: Fit, template: Template, moved: Iterable[Moved], latti
             if fields:
                 closed = LatticeFields.closed(fields["sdf"], lattice.grid)
                 seen = Seen(fields["radiance"], fields["known"], light)
-                found = Surface(replace(closed, msdf=fields["msdf"]), seen=seen, gains=fit.gains)
+                found = Surface(replace(closed, msdf=fields["msdf"]), seen=seen)
                 return found, candidate.stage
     return None, ""
 

@@ -119,7 +119,7 @@ def fitted(photographed, tmp_path_factory) -> Path:
     seen, run = [], Joint.run
 
     def watched(self, fit, surface, steps):
-        seen.append((fit.gains, fit.scene.targets[0].rgba.copy()))
+        seen.append((surface.gains, fit.scene.targets[0].rgba.copy()))
         return run(self, fit, surface, steps)
 
     with pytest.MonkeyPatch.context() as patch:
