@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -14,8 +14,7 @@ from .mask_outline import mask_distance, sharp
 
 
 def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray], *,
-                daylight_votes: float = 0.06, disbelieved: int = 0,
-                progress: Callable[[], object] | None = None) -> mi.Float:
+                daylight_votes: float = 0.06, progress: Callable[[], object] | None = None) -> mi.Float:
     """Signed distance to the visual hull at ``points``, negative inside.
 
     Each view bounds the object by the cone over its mask; the hull is their intersection, the
@@ -28,7 +27,6 @@ def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray
         views: the cameras.
         alphas: per view, (height, width) coverage.
         daylight_votes: fraction of the views that have to see daylight at a point (at least 2 do).
-        disbelieved: masks that are not believed at a point: those that it is farthest outside of.
         progress: called without arguments after each view.
 
     Returns:
@@ -36,12 +34,25 @@ def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray
         whole object, so it also carves what it does not frame; points that no view says anything of are
         outside (+inf).
     """
+    return doubting_hulls(points, views, alphas, [0], daylight_votes=daylight_votes, progress=progress)[0]
+
+
+def doubting_hulls(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray],
+                   disbelieved: Sequence[int], *, daylight_votes: float = 0.06,
+                   progress: Callable[[], object] | None = None) -> list[mi.Float]:
+    """Signed distances to hulls that do not believe so many masks: at each point those that it is farthest
+    outside of.
+
+    Args:
+        points, views, alphas, daylight_votes, progress: as of ``visual_hull``, which believes all.
+        disbelieved: numbers of masks, one for each hull.
+    """
     thin_parts = sharp(alphas)
     votes = max(2, round(daylight_votes * len(views)))
     # The largest distances to the filled masks, and to the unfilled ones, sorted: the last one has as many
     # supporters as there are.
     carved, daylight = ([dr.full(mi.Float, -dr.inf, dr.width(points)) for _ in range(count)]
-                        for count in (1 + disbelieved, votes))
+                        for count in (1 + max(disbelieved), votes))
     for index, alpha in enumerate(alphas):
         whole = not _touches_border(alpha)
         outline = mask_distance(alpha, thin_parts=thin_parts)
@@ -55,8 +66,8 @@ def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray
         dr.eval(carved, daylight)
         if progress:
             progress()
-    distance = dr.maximum(carved[-1], daylight[-1])
-    return dr.select(distance == -dr.inf, dr.inf, distance)
+    distances = [dr.maximum(carved[number], daylight[-1]) for number in disbelieved]
+    return [dr.select(distance == -dr.inf, dr.inf, distance) for distance in distances]
 
 
 def _has_holes(alpha: np.ndarray) -> bool:

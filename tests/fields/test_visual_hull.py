@@ -7,7 +7,7 @@ from scipy import ndimage
 from topology import assert_manifold, component_count, euler_characteristic
 
 from gshell_mi.extraction import extract
-from gshell_mi.fields.visual_hull import visual_hull
+from gshell_mi.fields.visual_hull import doubting_hulls, visual_hull
 from gshell_mi.lattice import TetLattice
 from gshell_mi.views import PinholeViews
 
@@ -148,4 +148,6 @@ def test_masks_that_are_not_believed():
     masks[4] = np.zeros_like(masks[4])
     assert visual_hull(points, views, masks).numpy().min() > 0
     # All points are farthest outside of the empty mask, so the next one tells.
-    np.testing.assert_allclose(visual_hull(points, views, masks, disbelieved=1).numpy(), expected, atol=1e-6)
+    believing, doubting = doubting_hulls(points, views, masks, [0, 1])
+    np.testing.assert_array_equal(believing.numpy(), visual_hull(points, views, masks).numpy())
+    np.testing.assert_allclose(doubting.numpy(), expected, atol=1e-6)

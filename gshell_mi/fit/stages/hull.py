@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +14,7 @@ from ...fields import LatticeFields
 from ...fields.interpolation import Interpolation
 from ...fields.lattice_fields import closed_at_border
 from ...fields.thin_parts import thickened, thin_part_refinement
-from ...fields.visual_hull import visual_hull
+from ...fields.visual_hull import doubting_hulls
 from ...lattice import CubeLattice, Lattice
 from ...scene import FitScene
 from ..bounds import Between
@@ -51,7 +51,7 @@ class Hull:
             UserError: the masks have nothing in common.
         """
         with steps.task(total=len(fit.views)) as advance:
-            hull = hull_of(fit, fit.alphas, progress=advance)
+            (hull,) = hulls_of(fit, fit.alphas, progress=advance)
         if not (hull.fields.sdf < 0).any():
             raise UserError(
                 f"The masks of the targets have no common volume in the box of '{fit.scene.path}'; check "
@@ -59,27 +59,28 @@ class Hull:
         return hull
 
 
-def hull_of(fit: Fit, alphas: list[np.ndarray], *, disbelieved: int = 0,
-            progress: Callable[[], object] | None = None) -> Surface:
-    """The visual hull of some masks on the early lattice, with what is too thin for that grown.
+def hulls_of(fit: Fit, alphas: list[np.ndarray], disbelieved: Sequence[int] = (0,),
+             progress: Callable[[], object] | None = None) -> list[Surface]:
+    """Visual hulls of some masks on the early lattice, with what is too thin for that grown.
 
     Args:
         fit: the views, the lattice and the settings.
-        alphas, disbelieved, progress: as of ``visual_hull``.
+        alphas, disbelieved, progress: as of ``doubting_hulls``.
     """
     subject, lattice = fit.scene.subject, fit.lattices.early
     finer = thin_part_refinement(lattice.resolution)
     samples = CubeLattice(finer * lattice.resolution)
     points = mi.Transform4f(subject.to_world) @ mi.Point3f(samples.points(mi.Float))
-    world = visual_hull(points, fit.views, alphas, daylight_votes=fit.config.hull.daylight_votes,
-                        disbelieved=disbelieved, progress=progress)
-    cell = lattice.spacing
-    solid = np.clip(world.numpy() / subject.length_scale, -1, 1) / cell
-    grown = thickened(solid.reshape((samples.stride,) * 3), finer)
-    vertices = lattice.points(mi.Float)
-    sdf, hull = (closed_at_border(Interpolation(mi.Float(cell * field.ravel()), samples)(vertices).numpy(),
-                                  lattice) for field in (grown, solid))
-    return Surface(LatticeFields.closed(sdf, lattice.grid), hull=hull)
+    cell, vertices = lattice.spacing, lattice.points(mi.Float)
+    found = []
+    for world in doubting_hulls(points, fit.views, alphas, disbelieved, progress=progress,
+                                daylight_votes=fit.config.hull.daylight_votes):
+        solid = np.clip(world.numpy() / subject.length_scale, -1, 1) / cell
+        grown = thickened(solid.reshape((samples.stride,) * 3), finer)
+        sdf, hull = (closed_at_border(Interpolation(mi.Float(cell * field.ravel()), samples)(vertices)
+                                      .numpy(), lattice) for field in (grown, solid))
+        found.append(Surface(LatticeFields.closed(sdf, lattice.grid), hull=hull))
+    return found
 
 
 class Given:

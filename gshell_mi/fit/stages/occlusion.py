@@ -25,7 +25,7 @@ from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface
 from ..template import template_of
-from .hull import hull_of
+from .hull import hulls_of
 
 #: A hull that believes less is proposed where it is larger by this many cells: masks are not exact.
 _THICKER = 1.2
@@ -63,32 +63,33 @@ class Occlusion:
         ignored = [np.zeros(alpha.shape, bool) for alpha in fit.alphas]
         cell = fit.lattices.early.spacing * fit.scene.subject.length_scale
         facts: dict[str, list[float]] = {"gain": [], "noise": []}
-        with steps.task(total=(1 + len(disbelieved)) * count) as advance:
-            hull = _mesh(fit, hull_of(fit, fit.alphas, progress=advance))
-            for number in disbelieved if len(hull[1]) else ():
-                alphas = [np.maximum(alpha, pixels) for alpha, pixels in zip(fit.alphas, ignored, strict=True)]
-                larger = _mesh(fit, hull_of(fit, alphas, disbelieved=number, progress=advance))
-                place = _larger(hull, larger, cell)
+        with steps.task():
+            before, *larger = _meshes(fit, ignored, [0, *disbelieved])
+            shown = fit.judge.shown(before)
+            for level in range(len(disbelieved) if len(before[1]) else 0):
+                after = larger[level]
+                place = _larger(before, after, cell)
                 if (place < 0).all():
                     continue
-                before = fit.judge.shown(hull)
-                verdict = fit.judge.compare(before, fit.judge.shown(larger, like=before), (larger, place))
+                verdict = fit.judge.compare(shown, fit.judge.shown(after, like=shown), (after, place))
                 for name, values in verdict.facts().items():
                     facts[name] += values
                 chosen = (place >= 0) & verdict.accepted[place]
                 if chosen.any():
-                    ignored = [already | new for already, new in zip(ignored, _denying(fit, larger, chosen),
+                    ignored = [already | new for already, new in zip(ignored, _denying(fit, after, chosen),
                                                                      strict=True)]
-                    alphas = [np.maximum(*each) for each in zip(fit.alphas, ignored, strict=True)]
-                    hull = _mesh(fit, hull_of(fit, alphas))
+                    before, *larger = _meshes(fit, ignored, [0, *disbelieved])
+                    shown = fit.judge.shown(before)
         views = sum(bool(pixels.any()) for pixels in ignored)
         steps.fact("occlusion_verdict", facts)
         steps.fact("occluded_views", views)
         return replace(surface, ignored=packed(ignored)) if views else surface
 
 
-def _mesh(fit: Fit, hull: Surface) -> Mesh:
-    return template_of(fit.scene.subject, hull).closed
+def _meshes(fit: Fit, ignored: list[np.ndarray], disbelieved: list[int]) -> list[Mesh]:
+    """Hulls that do not believe so many masks, without the pixels that are ignored."""
+    alphas = [np.maximum(*each) for each in zip(fit.alphas, ignored, strict=True)]
+    return [template_of(fit.scene.subject, hull).closed for hull in hulls_of(fit, alphas, disbelieved)]
 
 
 def _larger(hull: Mesh, larger: Mesh, cell: float) -> np.ndarray:

@@ -119,3 +119,12 @@ def test_a_fit_goes_on_without_what_is_ignored(bowl_scene, tmp_path, monkeypatch
     for known in seen[0]:
         assert (known[:, :24] == 0).all() and (known[:, 24:] == 1).all()
     assert json.loads((output / "metrics.json").read_text())["config"]["occlusion"]["most"] == 0.1
+
+
+def test_masks_that_have_nothing_in_common_are_left_to_the_hull(exact):
+    """Half of the masks are empty: there is no hull, and none that disbelieves a tenth."""
+    targets = [dataclasses.replace(target, rgba=target.rgba * np.float32(index % 2))
+               for index, target in enumerate(exact.scene.targets)]
+    fit = Fit(dataclasses.replace(exact.scene, targets=targets), exact.config, exact.lattices)
+    before = start(fit)
+    assert Occlusion(FitConfig().occlusion).run(fit, before, Silent()) is before
