@@ -51,14 +51,14 @@ class Diagnostics:
             found.append("no surface is left: look at views/, and check cameras and masks.")
         if self.floaters:
             found.append(f"{counted(self.floaters, 'loose piece')} of less than 2 % of the area: raise "
-                         f"--min-area, or add --losses.extra sdf_sign 0.002, or delete in Blender.")
+                         f"--topology.min-area, or add --losses.extra sdf_sign 0.002, or delete in Blender.")
         if self.pieces > 1:
             found.append(f"the surface is in {self.pieces} pieces: if the object is in one, its thin parts "
                          f"were lost; raise --resolution.")
         if self.pinholes:
             found.append(f"{counted(self.pinholes, 'pin-hole')} beside "
                          f"{counted(self.boundary_loops, 'boundary loop')}: add --losses.extra hole_closing "
-                         f"1, or raise --min-area.")
+                         f"1, or raise --topology.min-area.")
         if self.self_contact > CONTACT_LIMIT:
             found.append(f"{100 * self.self_contact:.0f} % of the surface is within a cell of another sheet "
                          f"of its template, where details merge: raise --resolution.")

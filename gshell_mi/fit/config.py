@@ -23,6 +23,31 @@ from .stages.texture import TextureConfig
 
 
 @dataclass(frozen=True)
+class LatticeConfig:
+    """How fine lattices are, and how their fields are stored."""
+
+    start_resolution: Annotated[int, Between(4)] = 64
+    """Cells per side, at most, up to the detail stage. Unused if the scene gives the fields."""
+    band_resolution: Annotated[int, Between(4)] = 128
+    """From this resolution on the joint stage stores its fields in blocks around the surface."""
+
+
+@dataclass(frozen=True)
+class TopologyConfig:
+    """What counts as an opening, a part and a sheet."""
+
+    min_area: Annotated[float, Between(0, 1)] = 0.005
+    """Holes smaller than this fraction of the template's area are noise and are undone, and islands smaller
+    than this fraction of the surface's."""
+    unseen_area: Annotated[float, Between(0, 1)] = 0.02
+    """What no view sees, from neither side, is opened if it is connected and larger than this fraction of
+    the template's area; 1 keeps it."""
+    sheet_thickness: float = 0.5
+    """Closed parts that are at most so thick, in cells, come out as a single open sheet; 0 keeps both sides
+    of every sheet, beside openings too."""
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Settings of a fit; the defaults are meant for every object.
 
@@ -38,10 +63,6 @@ class FitConfig:
     """Cells per side of the lattice; default: that of the scene's gshell shape (64)."""
     grid: Literal["tet", "cube", "flexicubes", "bcc"] | None = None
     """The kind of lattice; default: that which the scene's gshell shape names, or flexicubes."""
-    start_resolution: Annotated[int, Between(4)] = 64
-    """Cells per side, at most, up to the detail stage. Unused if the scene gives the fields."""
-    band_resolution: Annotated[int, Between(4)] = 128
-    """From this resolution on the joint stage stores its fields in blocks around the surface."""
     iterations: int = 210
     """Steps of the joint stage."""
     known_light: bool = False
@@ -62,15 +83,6 @@ class FitConfig:
     scene, the mask loss of the joint stage is off, and shading normals are those of the faces."""
     watertight: bool = False
     """The object is closed: the mSDF stays positive and no openings are looked for."""
-    min_area: Annotated[float, Between(0, 1)] = 0.005
-    """Holes smaller than this fraction of the template's area are noise and are undone, and islands smaller
-    than this fraction of the surface's."""
-    unseen_area: Annotated[float, Between(0, 1)] = 0.02
-    """What no view sees, from neither side, is opened if it is connected and larger than this fraction of
-    the template's area; 1 keeps it."""
-    sheet_thickness: float = 0.5
-    """Closed parts that are at most so thick, in cells, come out as a single open sheet; 0 keeps both sides
-    of every sheet, beside openings too."""
     triptychs: Annotated[int, Between(1)] = 16
     """Training views, spread evenly, that are rendered at the end: for views/ and for psnr_training."""
     hold_out: Annotated[int, Between(0)] = 0
@@ -79,6 +91,10 @@ class FitConfig:
     checkpoint_seconds: float = 10.0
     """Seconds between checkpoints: what a kill loses at most."""
 
+    lattice: LatticeConfig = field(default_factory=LatticeConfig)
+    """How fine lattices are, and how their fields are stored."""
+    topology: TopologyConfig = field(default_factory=TopologyConfig)
+    """What counts as an opening, a part and a sheet."""
     occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
     """Pixels whose masks deny what others see."""
     hull: HullConfig = field(default_factory=HullConfig)

@@ -8,7 +8,10 @@ from ..errors import UserError
 
 #: What became of the flags, by the new group: old name, new name.
 _MOVED = {
-    "": {"ghost-min-area": "min-area", "preview": "effort preview"},
+    "": {"preview": "effort preview"},
+    "lattice": {name: name for name in ("start-resolution", "band-resolution")},
+    "topology": {"ghost-min-area": "min-area"} | {name: name for name in ("min-area", "unseen-area",
+                                                                         "sheet-thickness")},
     "hull": {"hull-daylight-votes": "daylight-votes"},
     "radiance": {"ghost-batch": "batch", "ghost-sheets": "layers", "ghost-lr": "lr",
                  "ghost-smoothing": "smoothing"},

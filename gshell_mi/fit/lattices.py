@@ -41,7 +41,9 @@ class Lattices:
         """The lattices of a fit of the gshell shape ``subject``."""
         last = last_lattice(subject, config)
         # Given fields may have detail that no coarser lattice holds.
-        coarse = last.resolution if subject.filename else min(last.resolution, config.start_resolution)
+        coarse = last.resolution
+        if not subject.filename:
+            coarse = min(coarse, config.lattice.start_resolution)
         finest = max(last.resolution, config.volume.resolution)
         return cls(make_lattice(_EARLY_GRIDS[last.grid], coarse), make_lattice(last.grid, coarse), last,
                    make_lattice(last.grid, config.resolution or finest))

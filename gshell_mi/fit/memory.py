@@ -68,8 +68,8 @@ class MemoryEstimate:
         whole = resolution
         moves = parametrisation_named(config.model.field).moves_weights
         weights = make_lattice(grid, resolution).weight_count if moves else 0
-        if resolution >= config.band_resolution and make_lattice(grid, 1).fits_in_blocks:
-            whole = min(resolution, config.start_resolution)
+        if resolution >= config.lattice.band_resolution and make_lattice(grid, 1).fits_in_blocks:
+            whole = min(resolution, config.lattice.start_resolution)
             weights = min(weights, _WEIGHTS_PER_SQUARE_CELL * resolution**2)
         vertices = make_lattice(grid, whole).vertex_count
         pixels = np.asarray(sizes, np.int64).prod(axis=1)

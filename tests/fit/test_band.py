@@ -112,8 +112,8 @@ def test_material_is_carried_to_a_finer_lattice(fit):
 def test_a_fit_in_blocks_is_resumed(bowl_scene, tmp_path, monkeypatch):
     output = tmp_path / "out"
     command = [str(bowl_scene), "-o", str(output), "--quiet", *SHORT, *CLOSED, "--resolution", "40",
-               "--start-resolution", "16", "--band-resolution", "32", "--checkpoint-seconds", "0",
-               "--iterations", "2", "--detail.iterations", "4"]
+               "--lattice.start-resolution", "16", "--lattice.band-resolution", "32",
+               "--checkpoint-seconds", "0", "--iterations", "2", "--detail.iterations", "4"]
     step = JointStage.step
 
     def stopped(self, iteration):

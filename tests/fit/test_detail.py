@@ -18,7 +18,7 @@ from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField
 from gshell_mi.scene import load_fit_scene
 
-CONFIG = FitConfig(band_resolution=32).changed({
+CONFIG = FitConfig().changed({"lattice.band_resolution": 32,
     "render.spp": 1, "render.primal_spp": 1, "render.max_depth": 2, "model.light_height": 4})
 
 
@@ -41,8 +41,8 @@ def test_it_starts_with_what_the_joint_stage_has_left(bowl_scene, resolution):
     left = Surface(joint.moved_fields(), seen=seen, model=joint.model())
 
     finer = FlexiCubesLattice(resolution)
-    start = start_fields(fit.subject, left, finer, CONFIG.band_resolution, {})
-    assert (start.blocks is None) == (resolution < CONFIG.band_resolution)
+    start = start_fields(fit.subject, left, finer, CONFIG.lattice.band_resolution, {})
+    assert (start.blocks is None) == (resolution < CONFIG.lattice.band_resolution)
     fit.subject.set_fields(start)
     vertices = fit.subject.surface.to_numpy()[0]
     assert np.abs(np.linalg.norm(vertices, axis=1) - RADIUS).mean() < 0.05 * lattice.spacing
@@ -71,11 +71,11 @@ def test_its_rates_are_those_of_what_has_settled():
     (("--iterations", "2", "--detail.iterations", "0"), {"joint": 2}),
     (("--iterations", "0"), {}),
     (("--iterations", "2", "--model.field", "multiresolution"), {"joint": 2}),
-    (("--iterations", "2", "--start-resolution", "24"), {"joint": 2}),
+    (("--iterations", "2", "--lattice.start-resolution", "24"), {"joint": 2}),
 ])
 def test_when_there_is_one(bowl_scene, tmp_path, arguments, stages):
-    command = [str(bowl_scene), "-o", str(tmp_path), "--quiet", *SHORT, *CLOSED, "--start-resolution", "16",
-               "--resolution", "24", *arguments]
+    command = [str(bowl_scene), "-o", str(tmp_path), "--quiet", *SHORT, *CLOSED,
+               "--lattice.start-resolution", "16", "--resolution", "24", *arguments]
     assert main(command) == 0
     log = [json.loads(line)["stage"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert {stage: log.count(stage) for stage in ("joint", "detail") if stage in log} == stages

@@ -20,7 +20,8 @@ SIZES = np.full((48, 2), 256)
 def test_targets_grow_with_pixels_and_the_lattice_with_cells():
     one, two = (MemoryEstimate.of(FitConfig(), 64, np.full((n, 2), 256)) for n in (48, 96))
     assert two.targets == 2 * one.targets and two.samples == one.samples
-    fine = MemoryEstimate.of(FitConfig(start_resolution=128, band_resolution=800), 128, SIZES)
+    fine = MemoryEstimate.of(FitConfig().changed({"lattice.start_resolution": 128,
+                                                    "lattice.band_resolution": 800}), 128, SIZES)
     assert 4 < fine.lattice / one.lattice < 8, "between the surface and the volume"
     fine, finest = (MemoryEstimate.of(FitConfig(), resolution, SIZES).lattice for resolution in (256, 512))
     assert finest < 4 * fine, "in blocks it follows the surface"

@@ -276,7 +276,7 @@ def test_smoothing_and_rates_of_0_switch_off(bowl_scene, tmp_path):
                              "refinement.radiance-lr", "joint.geometry-smoothing", "joint.geometry-detail",
                              "joint.geometry-lr", "joint.deform-lr", "joint.material-smoothing",
                              "joint.material-lr", "joint.light-lr", "checkpoint-seconds",
-                             "hull.daylight-votes", "min-area", "joint.warmup", "joint.color-hold")
+                             "hull.daylight-votes", "topology.min-area", "joint.warmup", "joint.color-hold")
            for word in (f"--{name}", "0")]
     assert main([str(bowl_scene), "-o", str(tmp_path), *SHORT, *CLOSED, "--iterations", "3", *off]) == 0
     losses = [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]

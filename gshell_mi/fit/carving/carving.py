@@ -39,7 +39,7 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
         The hollowed surface and what was seen of it; None if there is no hollow, none helps, or the surface
         would get other boundary loops.
     """
-    subject, lattice, min_area = fit.scene.subject, surface.lattice, fit.config.min_area
+    subject, lattice, min_area = fit.scene.subject, surface.lattice, fit.config.topology.min_area
     shape = (lattice.stride,) * 3
     opacity, seen = volume.opacity(), volume.seen()
     in_cells = (field.reshape(shape) / lattice.spacing for field in (surface.hull, surface.fields.msdf))

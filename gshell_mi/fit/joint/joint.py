@@ -167,7 +167,7 @@ class JointStage:
         self.apply(geometry=True)
         subject = self.subject
         self.parameters["subject.msdf"] = without_specks(subject.msdf, subject.template(), subject.lattice,
-                                                         self.config.min_area)
+                                                         self.config.topology.min_area)
         self.parameters.update()
 
     def moved_fields(self) -> LatticeFields:

@@ -319,7 +319,7 @@ class TopologyRevision:
 
     def _cleaned(self, vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> np.ndarray:
         """The mSDF (V,) without the openings and the islands that are too small to be meant."""
-        return clean_opacity(values, vertices, faces, self.joint.config.min_area)
+        return clean_opacity(values, vertices, faces, self.joint.config.topology.min_area)
 
     @property
     def _reach(self) -> float:

@@ -79,8 +79,8 @@ class DetailConfig(JointConfig):
     """Detail stage: the surface is nearly where it belongs, and the lattice is finer."""
 
     iterations: int = 60
-    """Steps of the detail stage, which continues the joint stage on a lattice finer than --start-resolution;
-    0 runs the joint stage itself on that lattice."""
+    """Steps of the detail stage, which continues the joint stage on a lattice finer than
+    --lattice.start-resolution; 0 runs the joint stage itself on that lattice."""
     warmup: Annotated[float, Between(0, 1)] = 0.0
     geometry_lr: float = 0.125
     geometry_smoothing: float = 4.0
@@ -115,7 +115,7 @@ class Joint:
                 return surface
             lattice = surface.on_grid(lattice.grid).lattice
         subject, config = fit.scene.subject, fit.config
-        fields = start_fields(subject, surface, lattice, config.band_resolution, steps.kept)
+        fields = start_fields(subject, surface, lattice, config.lattice.band_resolution, steps.kept)
         subject.set_fields(fields)
         joint = JointStage(fit.scene, start_material(fit.scene, surface, fields.lattice, config),
                            start_light(fit.scene, surface, config), config, stage=self.config,

@@ -87,11 +87,12 @@ class Openings:
         with steps.task("verdict"):
             logits = np.ones(len(vertices))
             if not fit.config.watertight:
+                min_area = fit.config.topology.min_area
                 thickness, _ = opposite_sides(template.start, template.start, faces, fit.cell(surface))
                 logits = find_openings(appearance, template.closed, fit.judge, closed, self.config.rounds,
                                        lambda logits: close_shallow(
-                                           clean_opacity(logits, vertices, faces, fit.config.min_area),
-                                           faces, np.isfinite(thickness)),
+                                           clean_opacity(logits, vertices, faces, min_area), faces,
+                                           np.isfinite(thickness)),
                                        lambda again: steps.repeat(training, count, again * count))
             opened = logits <= 0
             appearance.refit(~opened)

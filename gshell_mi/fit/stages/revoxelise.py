@@ -60,7 +60,7 @@ def best_revoxelised(fit: Fit, template: Template, moved: Iterable[Moved], latti
     Returns:
         The surface and the stage that has moved it; None and an empty name if none comes out whole.
     """
-    subject, min_area = fit.scene.subject, fit.config.min_area
+    subject, min_area = fit.scene.subject, fit.config.topology.min_area
     for candidate in moved:
         if (candidate.positions == template.vertices).all():
             continue
@@ -77,9 +77,9 @@ def best_revoxelised(fit: Fit, template: Template, moved: Iterable[Moved], latti
 
 def without_unseen_parts(fit: Fit, surface: Surface) -> Surface:
     """The surface without what no view sees from either side, if there is much of that."""
-    if fit.config.watertight or fit.config.unseen_area >= 1:
+    if fit.config.watertight or fit.config.topology.unseen_area >= 1:
         return surface
-    msdf = without_unseen(fit.scene.subject, surface.fields, fit.views, fit.config.unseen_area)
+    msdf = without_unseen(fit.scene.subject, surface.fields, fit.views, fit.config.topology.unseen_area)
     return surface if msdf is None else surface.with_fields(msdf=msdf.numpy())
 
 
@@ -87,11 +87,11 @@ def _cuts(fit: Fit, template: Template, moved: np.ndarray, cell: float) -> list[
     """How to cut a moved template, the best first."""
     config = fit.config
     # What has become too small by moving is noise, and no reason to leave all where it was.
-    logits = clean_opacity(template.logits, moved, template.faces, config.min_area)
+    logits = clean_opacity(template.logits, moved, template.faces, config.topology.min_area)
     found = topology(*positive_part(template.vertices, template.faces, logits))
     as_found = Cut(logits, moved, found, found.boundary_loops)
-    if config.watertight or not config.sheet_thickness:
+    if config.watertight or not config.topology.sheet_thickness:
         return [as_found]
-    cut = collapsed_sheets(as_found, template.vertices, template.faces, cell, config.sheet_thickness,
-                           config.min_area)
+    cut = collapsed_sheets(as_found, template.vertices, template.faces, cell, config.topology.sheet_thickness,
+                           config.topology.min_area)
     return [cut, as_found] if cut else [as_found]

@@ -18,7 +18,7 @@ from gshell_mi.scene import load_fit_scene
 #: Losses over the surface, whose size changes, that the defaults leave out.
 LOSSES = {"hole_opening": 1e-3, "hole_closing": 1e-3, "sdf_sign": 1e-3, "eikonal": 1e-3,
           "template_smoothness": 1e-3}
-CONFIG = FitConfig(iterations=100, band_resolution=99).changed({
+CONFIG = FitConfig(iterations=100).changed({"lattice.band_resolution": 99,
     "joint.warmup": 0.0, "joint.geometry_lr": 0.6, "render.views": 2, "render.spp": 2, "render.primal_spp": 2,
     "model.light_height": 8})
 

@@ -19,7 +19,7 @@ from gshell_mi.scene import load_fit_scene
 
 LATTICE = TetLattice(12)
 SUN = np.array([0.6, 0.64, 0.48])
-CONFIG = FitConfig(iterations=60, band_resolution=99).changed({
+CONFIG = FitConfig(iterations=60).changed({"lattice.band_resolution": 99,
     "joint.warmup": 1.0, "render.spp": 4, "render.primal_spp": 4, "render.max_depth": 2,
     "model.light_height": 8})
 

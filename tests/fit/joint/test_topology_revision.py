@@ -78,7 +78,7 @@ class StillJoint:
     def finish(self):
         self.apply(geometry=True)
         self.subject.msdf = without_specks(self.subject.msdf, self.subject.template(), LATTICE,
-                                           self.config.min_area)
+                                           self.config.topology.min_area)
         self.subject.set_fields(self.subject.fields())
 
     def seed(self, iteration):
