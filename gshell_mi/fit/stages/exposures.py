@@ -28,6 +28,9 @@ class GainsConfig:
     """Vertices, at most, whose colours in different views are compared."""
     prior: Annotated[float, Between(0.001)] = 1 / 3
     """Standard deviation in stops before anything was seen: cameras are set in steps of a third."""
+    least: Annotated[float, Between(0)] = 0.05
+    """Standard deviation in stops that gains have to have: what a shape that is not right yet makes up on
+    renders of a chair is half of that."""
 
 
 class Exposures:
@@ -49,6 +52,9 @@ class Exposures:
             seen = observe(mesh, fit.views, scene.targets, places=self.config.places, cell=fit.cell(surface),
                            turns=turns, seed=config.seed)
             found = find_gains(seen, self.config.prior * np.log(2))
-        steps.fact("exposures_verdict", found.verdict.facts() | {"look": found.look})
-        steps.fact("exposures_kept", found.count)
-        return replace(surface, gains=np.exp(found.log_gain).astype(np.float32)) if found.count else surface
+        stops = float(found.log_gain.std() / np.log(2))
+        kept = found.count and stops > self.config.least
+        steps.fact("exposures_verdict",
+                   found.verdict.facts() | {"look": found.look, "stops": round(stops, 4)})
+        steps.fact("exposures_kept", kept)
+        return replace(surface, gains=np.exp(found.log_gain).astype(np.float32)) if kept else surface
