@@ -11,6 +11,10 @@ import numpy as np
 
 from .errors import UserError
 
+#: Parameters of the two kinds of sensors: those that traversal shows, by their names in XML.
+OPTICS = {"perspective": ("principal_point_offset_x", "principal_point_offset_y", "near_clip", "far_clip"),
+          "thinlens": ("aperture_radius", "focus_distance", "near_clip", "far_clip")}
+
 
 @dataclass(frozen=True)
 class PinholeViews:
@@ -119,3 +123,8 @@ class PinholeViews:
     @cached_property
     def _pixel_sizes(self) -> mi.Float:
         return mi.Float(np.linalg.norm(self.bases[:, :, 0], axis=1) / self.sizes[:, 0])
+
+
+def kind_of(sensor: mi.Sensor) -> str:
+    """The plugin of a sensor that ``PinholeViews`` takes: one of ``OPTICS``."""
+    return "thinlens" if "aperture_radius" in mi.traverse(sensor) else "perspective"

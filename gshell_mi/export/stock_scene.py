@@ -14,6 +14,7 @@ from ..compat import environment_radiance, write_bitmap
 from ..errors import UserError
 from ..files import replacing
 from ..material import ATTRIBUTES
+from ..views import OPTICS, kind_of
 
 if TYPE_CHECKING:
     from ..light import EnvironmentLight
@@ -60,10 +61,6 @@ _SENSOR = """\
             <string name="pixel_format" value="rgba"/>
         </film>
     </sensor>"""
-
-#: Parameters of the two kinds of sensors: those that traversal shows, by their names in XML.
-_OPTICS = {"perspective": ("principal_point_offset_x", "principal_point_offset_y", "near_clip", "far_clip"),
-           "thinlens": ("aperture_radius", "focus_distance", "near_clip", "far_clip")}
 
 
 def write_light(path: Path, given: mi.Emitter, optimised: EnvironmentLight | None) -> None:
@@ -125,12 +122,12 @@ def up_axis(sensors: list[mi.Sensor]) -> int:
 
 def _sensor(sensor: mi.Sensor) -> str:
     parameters = mi.traverse(sensor)
-    kind = "thinlens" if "aperture_radius" in parameters else "perspective"
+    kind = kind_of(sensor)
     film = sensor.film()
     (width, height), (crop_width, crop_height) = film.size(), film.crop_size()
     crop_x, crop_y = film.crop_offset()
     optics = "\n".join(f'        <float name="{name}" value="{float(np.ravel(parameters[name])[0]):.9g}"/>'
-                       for name in _OPTICS[kind])
+                       for name in OPTICS[kind])
     return _SENSOR.format(kind=kind, id=quoteattr(sensor.id()), fov=float(parameters["x_fov"][0]),
                           optics=optics, to_world=_matrix(parameters["to_world"].matrix),
                           width=width, height=height, crop_width=crop_width, crop_height=crop_height,

@@ -2,6 +2,18 @@ import numpy as np
 import pytest
 
 
+@pytest.fixture(scope="module")
+def exact(bowl_scene):
+    """What the stages of a fit of the bowl may read, with the default settings."""
+    from gshell_mi.fit import FitConfig
+    from gshell_mi.fit.lattices import Lattices
+    from gshell_mi.fit.stage import Fit
+    from gshell_mi.scene import load_fit_scene
+
+    scene, config = load_fit_scene(bowl_scene), FitConfig()
+    return Fit(scene, config, Lattices.of(scene.subject, config))
+
+
 @pytest.fixture
 def decisions(monkeypatch):
     """Call it with what the judge shall say of the next changes of the whole surface: of the refinement, the

@@ -1,31 +1,16 @@
 """What a target does not know of makes no difference, whatever is there."""
 
 import dataclasses
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from silent_steps import Silent
 
-from gshell_mi.fit import FitConfig
 from gshell_mi.fit.joint.joint import JointStage
-from gshell_mi.fit.lattices import Lattices
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.hull import Hull
 from gshell_mi.fit.stages.joint import start_light, start_material
 from gshell_mi.fit.surface import Seen
-from gshell_mi.scene import load_fit_scene
-
-
-class Silent:
-    @contextmanager
-    def task(self, name="", total=None):
-        yield lambda: None
-
-
-@pytest.fixture(scope="module")
-def exact(bowl_scene) -> Fit:
-    scene, config = load_fit_scene(bowl_scene), FitConfig()
-    return Fit(scene, config, Lattices.of(scene.subject, config))
 
 
 def hidden(fit: Fit, color: float, alpha: float, *, told: bool) -> Fit:

@@ -9,8 +9,8 @@ import numpy as np
 
 from ...views import PinholeViews
 from ..judge import Verdict, verdict_of
-from .corrections import Corrections
-from .evidence import Evidence, projected
+from .corrections import Corrections, projected
+from .evidence import Evidence
 
 #: Standard deviation of a rotation, in radians, and of a shift over the distance, before anything was seen.
 _FIRST_GUESS = np.radians(0.3)

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...views import PinholeViews
+from ...views import OPTICS, PinholeViews, kind_of
 
 
 @dataclass(frozen=True)
@@ -67,25 +67,26 @@ class Corrections:
             views: as given.
             points: of the surface, world units.
         """
-        before, after = (_projected(each, points) for each in (views, self.views(views)))
-        return np.linalg.norm(after - before, axis=2).mean(axis=1)
+        before, after = ([projected(points - each.origins[view], each, view) for view in range(len(each))]
+                         for each in (views, self.views(views)))
+        return np.array([np.linalg.norm(there - here, axis=1).mean()
+                         for here, there in zip(before, after, strict=True)])
 
 
-def _projected(views: PinholeViews, points: np.ndarray) -> np.ndarray:
-    """(N, P, 2) positions in pixels."""
-    scaled = np.einsum("nij,npj->npi", np.linalg.inv(views.bases), points - views.origins[:, None])
-    return scaled[..., :2] / scaled[..., 2:] * views.sizes[:, None]
+def projected(offsets: np.ndarray, views: PinholeViews, view: int) -> np.ndarray:
+    """(K, 2) pixels, centres at integers, of (K, 3) offsets from a centre of projection."""
+    scaled = offsets @ np.linalg.inv(views.bases[view]).T
+    return scaled[:, :2] / scaled[:, 2:] * views.sizes[view] - 0.5
 
 
 def _moved(sensor: mi.Sensor, turn: np.ndarray, shift: np.ndarray) -> mi.Sensor:
     parameters = mi.traverse(sensor)
-    optics = ("principal_point_offset_x", "principal_point_offset_y", "near_clip", "far_clip",
-              "aperture_radius", "focus_distance")
+    kind = kind_of(sensor)
     to_world = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     to_world[:3, :3] = turn @ to_world[:3, :3]
     to_world[:3, 3] += shift
     return mi.load_dict({
-        "type": "thinlens" if "aperture_radius" in parameters else "perspective", "id": sensor.id(),
+        "type": kind, "id": sensor.id(),
         "fov": float(parameters["x_fov"][0]), "fov_axis": "x", "to_world": mi.ScalarTransform4f(to_world),
-        **{name: float(np.ravel(parameters[name])[0]) for name in optics if name in parameters},
+        **{name: float(np.ravel(parameters[name])[0]) for name in OPTICS[kind]},
         "film": sensor.film(), "sampler": sensor.sampler()})

@@ -15,6 +15,7 @@ from ...pixels import COVERED
 from ...targets import Target
 from ...triangles import unit
 from ...views import PinholeViews
+from .corrections import projected
 
 #: Least cosine between a normal and the direction to a camera: beyond, texture is foreshortened to nothing.
 _GRAZING = 0.3
@@ -118,8 +119,7 @@ class Texture:
             offset = self.points[index] - views.origins[view]
             pixel = projected(offset, views, view)
             value = _sampled(image, pixel)
-            slope = np.stack([_sampled(image, pixel + step) - _sampled(image, pixel - step)
-                              for step in (np.array([0.5, 0]), np.array([0, 0.5]))], axis=1)
+            slope = _slopes(image, pixel)
             good = np.isfinite(value) & np.isfinite(slope).all(axis=1)
             offset, pixel, value, slope, place, cosine = (
                 array[good] for array in (offset, pixel, value, slope, place, cosine))
@@ -170,24 +170,22 @@ class Outline:
         offset = ray.d.numpy().T[index] * found.t.numpy()[index, None]
         pixel = np.stack([column, row], axis=1).astype(float)
         value = self._distances[view][row, column]
-        slope = np.stack([_sampled(self._distances[view], pixel + step)
-                          - _sampled(self._distances[view], pixel - step)
-                          for step in (np.array([0.5, 0]), np.array([0, 0.5]))], axis=1)
+        slope = _slopes(self._distances[view], pixel)
         # The outermost pixels are half a pixel inside.
         residual = value - 0.5
         good = (np.abs(residual) < _REACH) & np.isfinite(slope).all(axis=1)
         return Evidence(offset[good], pixel[good], slope[good], residual[good], np.ones(int(good.sum())))
 
 
-def projected(offsets: np.ndarray, views: PinholeViews, view: int) -> np.ndarray:
-    """(K, 2) pixels, centres at integers, of (K, 3) offsets from a centre of projection."""
-    scaled = offsets @ np.linalg.inv(views.bases[view]).T
-    return scaled[:, :2] / scaled[:, 2:] * views.sizes[view] - 0.5
-
-
 def _sampled(image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     """Bilinear values at (K, 2) pixels, x first; NaN outside."""
     return ndimage.map_coordinates(image, pixel.T[::-1], order=1, mode="constant", cval=np.nan)
+
+
+def _slopes(image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """(K, 2) derivatives at (K, 2) pixels, per pixel."""
+    return np.stack([_sampled(image, pixel + step) - _sampled(image, pixel - step)
+                     for step in (np.array([0.5, 0]), np.array([0, 0.5]))], axis=1)
 
 
 def _framed(shape: tuple[int, ...]) -> np.ndarray:

@@ -3,19 +3,16 @@
 import dataclasses
 import json
 import shutil
-from contextlib import contextmanager
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from bowl import CLOSED, SHORT
+from silent_steps import Silent
 
-from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
-from gshell_mi.fit.lattices import Lattices
-from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.exposures import Exposures
 from gshell_mi.fit.stages.hull import Hull
 from gshell_mi.fit.stages.joint import Joint
@@ -31,26 +28,6 @@ def stops_of(count: int) -> np.ndarray:
     rng = np.random.default_rng(5)
     stops = rng.uniform(-0.5, 0.5, (count, 1)) + rng.uniform(-0.1, 0.1, (count, 3))
     return stops - stops.mean(axis=0)
-
-
-class Silent:
-    """Steps of which only the facts are kept."""
-
-    def __init__(self):
-        self.facts = {}
-
-    @contextmanager
-    def task(self, name="", total=None):
-        yield lambda: None
-
-    def fact(self, name, value):
-        self.facts[name] = value
-
-
-@pytest.fixture(scope="module")
-def exact(bowl_scene) -> Fit:
-    scene, config = load_fit_scene(bowl_scene), FitConfig()
-    return Fit(scene, config, Lattices.of(scene.subject, config))
 
 
 @pytest.fixture(scope="module")

@@ -2,44 +2,22 @@
 
 import dataclasses
 import json
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from bowl import CLOSED, SHORT
+from silent_steps import Silent
 
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
-from gshell_mi.fit.lattices import Lattices
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.hull import Hull
 from gshell_mi.fit.stages.occlusion import Occlusion
 from gshell_mi.fit.surface import Surface
 from gshell_mi.packed_pixels import unpacked
-from gshell_mi.scene import load_fit_scene
 
 #: Hides a part of the bowl: rows from the middle on, in these columns.
 VIEW, COLUMNS = 5, slice(0, 48)
-
-
-class Silent:
-    """Steps of which only the facts are kept."""
-
-    def __init__(self):
-        self.facts = {}
-
-    @contextmanager
-    def task(self, name="", total=None):
-        yield lambda: None
-
-    def fact(self, name, value):
-        self.facts[name] = value
-
-
-@pytest.fixture(scope="module")
-def exact(bowl_scene) -> Fit:
-    scene, config = load_fit_scene(bowl_scene), FitConfig()
-    return Fit(scene, config, Lattices.of(scene.subject, config))
 
 
 @pytest.fixture(scope="module")

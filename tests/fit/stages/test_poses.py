@@ -2,19 +2,17 @@
 
 import dataclasses
 import json
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bowl import CLOSED, RADIUS, SHORT
 from scipy.spatial.transform import Rotation
+from silent_steps import Silent
 
 from gshell_mi.export.stock_scene import write_scene
-from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
-from gshell_mi.fit.lattices import Lattices
 from gshell_mi.fit.poses.corrections import Corrections
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.poses import Poses
@@ -22,26 +20,6 @@ from gshell_mi.fit.surface import Surface
 from gshell_mi.scene import load_fit_scene
 from gshell_mi.scene_files import load_scene
 from gshell_mi.views import PinholeViews
-
-
-class Silent:
-    """Steps of which only the facts are kept."""
-
-    def __init__(self):
-        self.facts = {}
-
-    @contextmanager
-    def task(self, name="", total=None):
-        yield lambda: None
-
-    def fact(self, name, value):
-        self.facts[name] = value
-
-
-@pytest.fixture(scope="module")
-def exact(bowl_scene) -> Fit:
-    scene, config = load_fit_scene(bowl_scene), FitConfig()
-    return Fit(scene, config, Lattices.of(scene.subject, config))
 
 
 @pytest.fixture(scope="module")
