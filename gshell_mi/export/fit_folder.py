@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .. import __version__
 from ..files import replacing
 from ..light import turns_with_camera
 from ..material import attributes_of
@@ -76,7 +77,8 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
         **({"held_out": scores[HELD_OUT]} if fit.held_out else {}),
         **({} if gains is None else {"exposures": _exposures(fit, gains)}),
         "counts": dataclasses.asdict(topology(vertices, faces)),
-        "versions": {name: version(name) for name in ("gshell_mi", "mitsuba", "drjit", "numpy")},
+        "versions": {"gshell_mi": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__,
+                     "numpy": np.__version__},
         "variant": mi.variant(),
     }
 
