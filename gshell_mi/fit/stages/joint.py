@@ -27,6 +27,7 @@ from ..joint.topology_revision import TopologyRevision
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import TYPICAL_REFLECTANCE, Surface
+from ..unseen import without_unseen_parts
 
 if TYPE_CHECKING:
     from ..config import FitConfig
@@ -133,8 +134,8 @@ class Joint:
         changed = revision.finish()
         if changed is not None:
             steps.fact("openings_changed", changed)
-        return replace(surface, fields=joint.moved_fields(), hull=None, moved=(), model=joint.model(),
-                       revision=revision.state())
+        return without_unseen_parts(fit, replace(surface, fields=joint.moved_fields(), hull=None, moved=(),
+                                                 model=joint.model(), revision=revision.state()))
 
 
 def start_fields(subject: mi.Shape, surface: Surface, lattice: Lattice, band_resolution: int,

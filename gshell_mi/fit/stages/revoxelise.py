@@ -16,13 +16,13 @@ from ...lattice import Lattice
 from ...template.msdf import clean_opacity
 from ...template.revoxelise import revoxelise
 from ...template.thin_sheets import Cut, collapsed_sheets
-from ...template.unseen import without_unseen
 from ...topology import topology
 from ...triangles import positive_part
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Moved, Seen, Surface
 from ..template import Template, template_of
+from ..unseen import without_unseen_parts
 
 
 class Revoxelise:
@@ -73,14 +73,6 @@ def best_revoxelised(fit: Fit, template: Template, moved: Iterable[Moved], latti
                 found = Surface(replace(closed, msdf=fields["msdf"]), seen=seen)
                 return found, candidate.stage
     return None, ""
-
-
-def without_unseen_parts(fit: Fit, surface: Surface) -> Surface:
-    """The surface without what no view sees from either side, if there is much of that."""
-    if fit.config.watertight or fit.config.topology.unseen_area >= 1:
-        return surface
-    msdf = without_unseen(fit.scene.subject, surface.fields, fit.views, fit.config.topology.unseen_area)
-    return surface if msdf is None else surface.with_fields(msdf=msdf.numpy())
 
 
 def _cuts(fit: Fit, template: Template, moved: np.ndarray, cell: float) -> list[Cut]:

@@ -15,7 +15,8 @@ from ..radiance.volume_surface import volume_surface
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Moved, Surface
-from .revoxelise import best_revoxelised, without_unseen_parts
+from ..unseen import without_unseen_parts
+from .revoxelise import best_revoxelised
 
 
 class Volume:
