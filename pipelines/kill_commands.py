@@ -41,8 +41,8 @@ COMMANDS = {
     "export": (["export", "{}/fit", "--obj", "--texture-size", "256"], "fit"),
     "turntable": (["turntable", "{}/fit", "--frames", "8", "--size", "64", "--quiet"], "fit"),
     "report": (["report", "{}/fit", "--turntable-frames", "4", "--turntable-size", "64"], "fit"),
-    "fit": (["fit", "{}/in/bowl.xml", "-o", "{}/out", "--quiet", "--checkpoint-seconds", "0", *SHORT, *CLOSED,
-             "--joint.revision", "1"], "out"),
+    "fit": (["fit", "{}/in/bowl.xml", "-o", "{}/out", "--quiet", "--checkpoint-seconds", "0",
+             *SHORT, *CLOSED], "out"),
 }
 
 #: How far a fit's surface may be from that of a whole one, in % of its diagonal, and as a multiple of what

@@ -15,3 +15,7 @@ class Silent:
 
     def fact(self, name, value):
         self.facts[name] = value
+
+    def run(self, work, count, *_, **__):
+        for iteration in range(count):
+            work.step(iteration)

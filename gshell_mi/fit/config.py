@@ -181,7 +181,7 @@ _PREVIEW = {"resolution": 48, "iterations": 70, "triptychs": 4, "radiance.batch"
             "occlusion.most": 0.0, "openings.iterations": 600, "openings.rounds": 0, "cavities.iterations": 0,
             "refinement.iterations": 0, "volume.iterations": 0, "render.views": 1, "render.primal_spp": 4,
             "render.max_depth": 2, "model.even_start": False, "model.light_height": 16, "texture.rounds": 1,
-            "joint.color_hold": 0.0, "joint.revision": 1.0}
+            "joint.color_hold": 0.0, "openings.revise": False}
 
 #: Twice as many steps of every stage.
 _THOROUGH = {name: 2 * value for name, value in FitConfig().settings().items()

@@ -32,15 +32,15 @@ _MOVED = {
               | {name: f"extra {name.replace('-', '_')}" for name in (
                   "hole-opening", "hole-closing", "visible-outside", "visible-inside", "sdf-sign", "eikonal",
                   "template-smoothness", "albedo-chroma", "light-smoothness")},
-    "joint": {"second-look": "revision", "second-look-gain": "revision-gain",
-              "material-gradient-smoothing": "material-smoothing"}
+    "joint": {"material-gradient-smoothing": "material-smoothing"}
              | {name: name for name in ("warmup", "geometry-lr", "msdf-lr", "deform-lr", "geometry-smoothing",
                                         "geometry-detail", "material-lr", "color-hold", "light-lr")},
     "detail": {"detail-iterations": "iterations"},
 }
 
 #: Flags that nothing has taken the place of.
-GONE = ("color-voxels", "ghost-gain", "vessel-gain", "refinement-gain", "folds-gain")
+GONE = ("color-voxels", "ghost-gain", "vessel-gain", "refinement-gain", "folds-gain", "second-look",
+        "second-look-gain", "joint.revision", "joint.revision-gain")
 
 #: The new flag of each old one, without dashes.
 RENAMED = {old: f"{group}.{new}" if group else new for group, names in _MOVED.items()

@@ -15,6 +15,7 @@ from .stages.occlusion import Occlusion
 from .stages.openings import Openings
 from .stages.poses import Poses
 from .stages.refinement import Refinement
+from .stages.revision import Revision
 from .stages.revoxelise import Revoxelise
 from .stages.texture import Texture
 from .stages.volume import Volume
@@ -50,10 +51,12 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
         start.append(Volume(config.volume))                         # another start, if it is better
     # Networks are not tied to a lattice: theirs is the last one from the start.
     explicit = parametrisation_named(config.model.field).is_explicit
+    revises = config.openings.revise and not (given or config.watertight)
     if config.iterations and config.detail.iterations and explicit:
         start += [
             Joint("joint", config.joint, config.iterations, lattices.late),     # shape, material and light
             *([Poses(config.cameras)] if config.poses == "refine" else []),     # corrects the cameras
+            *([Revision(config.openings)] if revises else []),      # what is open after all
             Joint("detail", config.detail, config.detail.iterations, lattices.last, refines=True),
         ]
     else:

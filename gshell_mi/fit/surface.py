@@ -62,7 +62,7 @@ class Surface:
         seen: what was seen there; None before anything was looked at.
         moved: where stages have moved its template, the best first.
         model: material, light and texture that later stages have left, flat arrays by name.
-        revision: what a topology revision has changed, for the stages after it; flat arrays by name.
+        settled: whether material and light were fitted to just this, as these cameras see it.
         gains: (N, 3) what each view's channels are multiplied by, as it was exposed; None if by nothing.
         ignored: pixels that tell nothing, of all views one after the other, eight to a byte; None for none.
         poses: (N, 6) corrections of the cameras, as of ``Corrections``; None if they are as given.
@@ -73,7 +73,7 @@ class Surface:
     seen: Seen | None = None
     moved: tuple[Moved, ...] = ()
     model: Mapping[str, np.ndarray] = field(default_factory=dict)
-    revision: Mapping[str, np.ndarray] = field(default_factory=dict)
+    settled: bool = False
     gains: np.ndarray | None = None
     ignored: np.ndarray | None = None
     poses: np.ndarray | None = None
@@ -102,7 +102,7 @@ class Surface:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The surface as flat arrays, for ``from_arrays``."""
-        arrays = {"grid": np.array(GRIDS.index(self.fields.grid)),
+        arrays = {"grid": np.array(GRIDS.index(self.fields.grid)), "settled": np.array(self.settled),
                   "block_resolution": np.array(self.fields.block_resolution)}
         optional = {name: getattr(self.fields, name) for name in (*_FIELDS, *_OPTIONAL)}
         optional |= {"hull": self.hull} | {name: getattr(self, name) for name in _OF_VIEWS}
@@ -114,8 +114,7 @@ class Surface:
                        for name in ("positions", "radiance")}
             arrays |= {f"moved {index} {moved.stage} fitted {name}": array
                        for name, array in moved.fitted.items()}
-        for part in ("model", "revision"):
-            arrays |= {f"{part} {name}": array for name, array in getattr(self, part).items()}
+        arrays |= {f"model {name}": array for name, array in self.model.items()}
         return arrays
 
     @classmethod
@@ -130,7 +129,7 @@ class Surface:
         stages = sorted({tuple(name.split(" ")[1:3]) for name in arrays if name.startswith("moved ")})
         moved = [_moved(stage, _under(arrays, f"moved {index} {stage} ")) for index, stage in stages]
         return cls(fields, arrays.get("hull"), seen, tuple(moved), _under(arrays, "model "),
-                   _under(arrays, "revision "), **{name: arrays.get(name) for name in _OF_VIEWS})
+                   bool(arrays["settled"]), **{name: arrays.get(name) for name in _OF_VIEWS})
 
 
 def _moved(stage: str, arrays: Mapping[str, np.ndarray]) -> Moved:

@@ -9,7 +9,14 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from ..topology import mesh_components
+from ..topology import boundary_edges, mesh_components
+from ..triangles import vertex_areas
+
+#: A loose part is smaller than this fraction of the template.
+_LOOSE = 0.05
+
+#: Mean thickness, in cells, up to which a loose part is a sheet; lattices hold none thinner than one.
+_SHEET = 1.5
 
 
 def small_sheets(moved: np.ndarray, normals: np.ndarray, faces: np.ndarray, others: np.ndarray,
@@ -42,3 +49,30 @@ def small_sheets(moved: np.ndarray, normals: np.ndarray, faces: np.ndarray, othe
             side |= (part == index) & (normals @ across > 0)
             count += 1
     return side, count
+
+
+def loose_sheets(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, opened: np.ndarray,
+                 cell: float) -> np.ndarray:
+    """(V,) one side of each small part that is a closed sheet, unless the whole surface is closed.
+
+    What such a part borders of openings must be small beside it, as a neck that has been cut, by which the
+    template joins it to more than itself.
+
+    Args:
+        vertices, normals: (V, 3) of the template.
+        faces: (F, 3) of the watertight template, oriented outwards.
+        opened: (V,) where it is open.
+        cell: side of a lattice cell, in the unit of the vertices.
+    """
+    if opened.all() or not opened.any():
+        return np.zeros(len(vertices), bool)
+    areas = vertex_areas(vertices, faces)
+    whole, faces = areas.sum(), faces[~opened[faces].any(axis=1)]
+    part = mesh_components(faces, len(vertices))
+    area = np.bincount(part, areas)
+    start, end = boundary_edges(faces)[0].T
+    rim = np.bincount(part[start], np.linalg.norm(vertices[end] - vertices[start], axis=1), len(area))
+    # Any flat piece has twice that rim or more.
+    left_out = ((area > _LOOSE * whole) | (rim**2 >= np.pi * area))[part]
+    left_out |= np.bincount(faces.ravel(), minlength=len(vertices)) == 0
+    return small_sheets(vertices, normals, faces, left_out, _SHEET * cell)[0]

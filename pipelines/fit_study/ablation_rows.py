@@ -69,7 +69,7 @@ ROWS = [
             ("coarse-only", "smoothing 8 throughout",
              {"joint.geometry_smoothing": 8.0, "joint.geometry_detail": 8.0}),
             ("no-offsets", "no vertex offsets", {"joint.deform_lr": 0.0}),
-            ("no-revision", "no revision of openings", {"joint.revision": 1.0}),
+            ("no-revision", "no revision of openings", {"openings.revise": False}),
             ("one-view", "one view per step", {"render.views": 1}),
             ("no-warmup", "no warm-up", {"joint.warmup": 0.0}),
             ("shadow-derivatives", "visibility of shadows differentiated", {"render.reparam_depth": 2}),

@@ -15,6 +15,7 @@ from gshell_mi.fit.lattices import Lattices
 from gshell_mi.fit.pipeline import pipeline
 from gshell_mi.lattice import TetLattice
 
+END = ["poses", "revision", "detail", "texture"]
 START = ["openings", "exposures", "cavities", "refinement", "folds", "revoxelise"]
 KEPT = [stage for stage in START if stage != "exposures"]
 
@@ -26,20 +27,21 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
 
 
 @pytest.mark.parametrize(("settings", "expected"), [
-    ({}, ["occlusion", "hull", *START, "volume", "joint", "poses", "detail", "texture"]),
-    ({"volume.iterations": 0}, ["occlusion", "hull", *START, "joint", "poses", "detail", "texture"]),
+    ({}, ["occlusion", "hull", *START, "volume", "joint", *END]),
+    ({"volume.iterations": 0}, ["occlusion", "hull", *START, "joint", *END]),
     ({"iterations": 0}, ["occlusion", "hull", *START, "volume", "joint"]),
     ({"detail.iterations": 0}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
     ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
     ({"exposures": "keep"},
-     ["occlusion", "hull", *KEPT, "volume", "joint", "poses", "detail", "texture"]),
+     ["occlusion", "hull", *KEPT, "volume", "joint", *END]),
     ({"geometry_only": True},
-     ["occlusion", "hull", *KEPT, "volume", "joint", "poses", "detail", "texture"]),
-    ({"occlusion.most": 0.0}, ["hull", *START, "volume", "joint", "poses", "detail", "texture"]),
-    ({"poses": "keep"}, ["occlusion", "hull", *START, "volume", "joint", "detail", "texture"]),
-    ({"texture.rounds": 0}, ["occlusion", "hull", *START, "volume", "joint", "poses", "detail"]),
+     ["occlusion", "hull", *KEPT, "volume", "joint", *END]),
+    ({"occlusion.most": 0.0}, ["hull", *START, "volume", "joint", *END]),
+    ({"poses": "keep"}, ["occlusion", "hull", *START, "volume", "joint", "revision", "detail", "texture"]),
+    ({"openings.revise": False}, ["occlusion", "hull", *START, "volume", "joint", "poses", "detail", "texture"]),
+    ({"texture.rounds": 0}, ["occlusion", "hull", *START, "volume", "joint", "poses", "revision", "detail"]),
     ({"model.field": "flexicubes"},
-     ["occlusion", "hull", *START, "volume", "joint", "poses", "detail", "texture"]),
+     ["occlusion", "hull", *START, "volume", "joint", *END]),
 ])
 def test_stages_from_masks(settings, expected):
     assert names(mi.load_dict({"type": "gshell", "resolution": 12}), settings) == expected

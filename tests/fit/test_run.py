@@ -194,7 +194,7 @@ def test_interrupted_by_the_user(bowl_scene, tmp_path):
 def test_killed_and_resumed(bowl_scene, tmp_path):
     """Killed once in each stage, the fit takes the steps that it would have taken."""
     # Which vertices a revision opens is a choice, and rounding alone leads to another one.
-    options = "--joint.revision", "1", "--texture.rounds", "1"
+    options = "--openings.no-revise", "--texture.rounds", "1"
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert fit(bowl_scene, whole, *options) == 0
     for stage, iteration, resume in (("openings", 30, ()), ("cavities", 5, ("--resume",)),

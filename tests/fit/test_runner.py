@@ -138,12 +138,12 @@ def test_a_surface_is_what_its_arrays_say(tmp_path):
              for name in ("folds", "refinement")]
     seen = Seen(np.ones((count, 3)), np.ones(count, bool), np.float32(2))
     whole = replace(START, hull=np.arange(count), seen=seen, moved=tuple(moved),
-                    model={"log_radiance": np.ones((2, 4, 3))}, revision={"points": np.ones(2)},
+                    model={"log_radiance": np.ones((2, 4, 3))}, settled=True,
                     gains=np.full((3, 3), 1.1))
     checkpoint = Checkpoint("joint", 0, {}, whole.to_arrays())
     checkpoint.save(tmp_path / "checkpoint.npz")
     found = Surface.from_arrays(Checkpoint.load(tmp_path / "checkpoint.npz").arrays)
-    assert found.lattice == whole.lattice and found.seen.light == 2
+    assert found.lattice == whole.lattice and found.settled and found.seen.light == 2
     assert [one.stage for one in found.moved] == ["folds", "refinement"]
     assert found.to_arrays().keys() == whole.to_arrays().keys()
     for name, array in found.to_arrays().items():

@@ -18,7 +18,7 @@ from ...errors import UserError
 from ...files import replacing
 
 #: Raised when the meaning of the arrays changes.
-FORMAT = 6
+FORMAT = 7
 
 #: What comes after the last stage.
 DONE = "done"

@@ -42,8 +42,8 @@ def close_shallow(logits: np.ndarray, faces: np.ndarray, thin: np.ndarray) -> np
     return np.where(opened & shallow[patch], -logits, logits)
 
 
-def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
-                   closed: Shown) -> np.ndarray:
+def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge, before: Shown,
+                   given: np.ndarray | None = None) -> np.ndarray:
     """Closes the openings through which unseen views are not explained better than without them.
 
     A hull that bulges over a fold, or a highlight, makes the views disagree on a vertex's radiance as a
@@ -57,23 +57,25 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
         logits: (V,) opacity logits; surface where positive.
         template: the mesh that is opened.
         judge: of the fit.
-        closed: the template as the judge shows it.
+        before: the template without these openings as the judge shows it.
+        given: (V,) openings that have been justified; default: none.
 
     Returns:
         (V,) logits, those of rejected openings negated.
     """
     faces = template[1]
-    opened = logits <= 0
+    given = np.zeros(len(logits), bool) if given is None else given
+    opened = (logits <= 0) & ~given
     if not opened.any():
         return logits
-    if opened.all():
+    if (opened | given).all():
         # Nothing at all explains no image.
-        return -logits
+        return np.where(given, logits, -logits)
     kept, trimmed = opened, np.zeros_like(opened)
     for closing in reversed(range(_CLOSINGS)):
         place = places_of(kept, lobes(kept, faces))
-        shown = _shown(judge, template, ~kept, logits, closed)
-        verdict = judge.compare(closed, shown, (template, place))
+        shown = _shown(judge, template, ~(kept | given), logits, before)
+        verdict = judge.compare(before, shown, (template, place))
         worst = ~verdict.accepted
         # The worst first; all where none is worse but some are not surely better, and in the last round.
         if closing:
@@ -84,7 +86,7 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge,
             break
         anew = rejected & ~trimmed
         if closing and anew.any():
-            anew &= _gains(judge, template, closed, shown, anew) > 0
+            anew &= _gains(judge, template, before, shown, anew) > 0
             # Crumbs of what is rejected are chance: there are so many of them.
             share = np.bincount(place[kept], anew[kept]) / np.bincount(place[kept])
             anew &= share[place] > 0.5
@@ -103,7 +105,7 @@ def open_rejected(logits: np.ndarray, template: Mesh, judge: Judge, closed: Show
     A highlight on the inside of a bowl may be explained by a piece of the lid.
 
     Args:
-        logits, template, judge, closed: as of ``close_rejected``.
+        logits, template, judge, closed: as of ``close_rejected``, closed everywhere.
 
     Returns:
         (V,) logits, those of rejected islands negated.

@@ -23,7 +23,6 @@ from ...scene import FitScene
 from ...template.msdf_transfer import transfer_msdf
 from ..bounds import Between
 from ..joint.joint import JointStage
-from ..joint.topology_revision import TopologyRevision
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import TYPICAL_REFLECTANCE, Surface
@@ -35,8 +34,8 @@ if TYPE_CHECKING:
 #: Share of the surrounding vertices that have a radiance, from which a point between them has one.
 _KNOWN = 0.1
 
-#: Names of what is kept of a revision, and of fields in blocks, of a stage that goes on.
-_REVISION, _BLOCKS = "revision ", "blocks "
+#: Names of what is kept of fields in blocks of a stage that goes on.
+_BLOCKS = "blocks "
 
 
 @dataclass(frozen=True)
@@ -66,13 +65,6 @@ class JointConfig:
     sought: shading that colours take up first, the light never gets back."""
     light_lr: float = 0.75
     """Adam's step for the environment map (logarithm of its radiance) at the texel that is told most."""
-    revision: Annotated[float, Between(0, 1)] = 0.5
-    """Fraction of the steps after which openings grow where what is behind the surface beside them explains
-    the images about as well, and small ones are shut that explain them badly; 1 leaves it out."""
-    revision_gain: float = 3.0
-    """Such a change stays if, after half of the remaining steps, the squared image error there is below this
-    multiple of what it was, times what the rest of the surface has gained meanwhile. Above 1, as colours were
-    fitted to a cap for longer than anything was to what is behind it."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +80,6 @@ class DetailConfig(JointConfig):
     material_lr: float = 0.06
     color_hold: Annotated[float, Between(0, 1)] = 0.0
     light_lr: float = 0.225
-    revision: Annotated[float, Between(0, 1)] = 1.0
 
 
 class Joint:
@@ -99,8 +90,7 @@ class Joint:
         config: its settings.
         iterations: its steps.
         lattice: to work on, unless the surface is on a finer one.
-        refines: whether there is nothing to do on a surface that is as fine already, and seen from where the
-            cameras were given.
+        refines: whether there is nothing to do on a surface that is as fine already, and settled.
     """
 
     def __init__(self, name: str, config: JointConfig, iterations: int, lattice: Lattice, *,
@@ -112,7 +102,7 @@ class Joint:
         """The surface with material and light."""
         lattice = self.lattice
         if surface.lattice.resolution >= lattice.resolution:
-            if self.refines and surface.poses is None:
+            if self.refines and surface.settled:
                 return surface
             lattice = surface.on_grid(lattice.grid).lattice
         subject, config = fit.scene.subject, fit.config
@@ -127,15 +117,11 @@ class Joint:
                     joint.geometry.fit_step(iteration)
                     advance()
                 joint.geometry.begin()
-        revised = _under(steps.kept, _REVISION) or surface.revision
-        revision = TopologyRevision(joint, fit.views, fit.pixels, fit.judge, revised)
-        steps.run(revision, self.iterations, joint.optimizers, lambda: (
-            _prefixed(_REVISION, revision.state()) | _prefixed(_BLOCKS, block_arrays(subject.fields()))))
-        changed = revision.finish()
-        if changed is not None:
-            steps.fact("openings_changed", changed)
+        steps.run(joint, self.iterations, joint.optimizers, lambda: _prefixed(
+            _BLOCKS, block_arrays(subject.fields())))
+        joint.finish()
         return without_unseen_parts(fit, replace(surface, fields=joint.moved_fields(), hull=None, moved=(),
-                                                 model=joint.model(), revision=revision.state()))
+                                                 model=joint.model(), settled=True))
 
 
 def start_fields(subject: mi.Shape, surface: Surface, lattice: Lattice, band_resolution: int,

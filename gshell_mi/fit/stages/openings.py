@@ -63,6 +63,8 @@ class OpeningsConfig:
     """Weight of the tie between the chroma of a sheet's two sides."""
     rounds: int = 3
     """How often, at most, the steps are done again for what wrong openings have hidden."""
+    revise: bool = True
+    """Ask once more when the joint stage has moved the surface."""
 
 
 class Openings:
@@ -143,6 +145,31 @@ class OpacityTraining:
         return self.appearance.preview()
 
 
+def justified(smoothed: np.ndarray, logits: np.ndarray, clean: Callable[[np.ndarray], np.ndarray],
+              judged: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Openings, proposed at one level of opacity after the other.
+
+    Args:
+        smoothed: (V,) opacity logits that propose.
+        logits: (V,) negative where the surface is open already.
+        clean: as of ``find_openings``.
+        judged: gives (V,) proposed logits that say yes only to what is justified.
+
+    Returns:
+        (V,) logits, negative at openings.
+    """
+    for level in _LEVELS:
+        # Openings of the levels before, and what is as transparent as this one.
+        candidate = clean(np.minimum(logits, smoothed - level))
+        if not ((candidate <= 0) & (logits > 0)).any():
+            continue
+        found = clean(judged(candidate))
+        logits = np.minimum(logits, found)
+        if ((found <= 0) == (candidate <= 0)).all():
+            break
+    return logits
+
+
 def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, closed: Shown, rounds: int,
                   clean: Callable[[np.ndarray], np.ndarray], train: Callable[[int], None]) -> np.ndarray:
     """Where the images justify an opening.
@@ -168,17 +195,8 @@ def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, clo
         smoothed = appearance.smoothed_logits()
         proposed = clean(np.where(opened, np.minimum(smoothed, _OPEN), smoothed))
         logits = np.where(opened, _OPEN, np.abs(smoothed))
-        for level in _LEVELS:
-            # Openings of the levels before, and what is as transparent as this one.
-            candidate = clean(np.minimum(logits, smoothed - level))
-            if not ((candidate <= 0) & (logits > 0)).any():
-                continue
-            found = clean(close_rejected(candidate, template, judge, closed))
-            found = clean(open_rejected(found, template, judge, closed))
-            logits = np.minimum(logits, found)
-            if ((found <= 0) == (candidate <= 0)).all():
-                break
-        logits = clean(logits)
+        logits = clean(justified(smoothed, logits, clean, lambda candidate: open_rejected(
+            clean(close_rejected(candidate, template, judge, closed)), template, judge, closed)))
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
         unjustified |= (proposed <= 0) & (logits > 0)

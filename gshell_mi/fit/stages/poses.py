@@ -75,7 +75,7 @@ class Poses:
         if not kept:
             return surface
         steps.fact("poses", _facts(fit, alignment.corrections, texture.points))
-        return replace(surface, poses=alignment.corrections.to_array())
+        return replace(surface, poses=alignment.corrections.to_array(), settled=False)
 
 
 def _facts(fit: Fit, corrections: Corrections, points: np.ndarray) -> dict[str, Any]:

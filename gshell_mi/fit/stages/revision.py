@@ -1,0 +1,105 @@
+"""Revision: openings are judged again where the images have moved the surface.
+
+They are first sought on a hull, before anything is known of exposures, cameras and hollows. Where much of
+that is wrong, what is seen through a true opening is explained no better than by its cap, and a false one
+may be right behind the surface. So the same radiance with opacity, and the same judge, are asked once more.
+What is open and explains unseen views worse than its cap closes; what is proposed and explains them better
+opens; what nobody tells of stays as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+
+from ...fields.smoothing import MeshDiffusion
+from ...template.msdf import clean_opacity, reopened, rewritten
+from ...template.sides import opposite_sides
+from ...template.small_sheets import loose_sheets
+from ...topology import lobes
+from ...triangles import positive_part
+from ..judge import places_of
+from ..radiance.acceptance import close_rejected, close_shallow
+from ..radiance.shown import Mesh
+from ..radiance.surface_radiance import SurfaceRadiance
+from ..runner import Steps
+from ..stage import Fit
+from ..surface import Surface
+from .openings import OpacityTraining, OpeningsConfig, justified
+
+#: Lambda that smooths new rims along the template.
+_SMOOTHING = 3.0
+
+
+class Revision:
+    """Opens and closes what the images justify by now."""
+
+    name = "revision"
+
+    def __init__(self, config: OpeningsConfig):
+        self.config = config
+
+    def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
+        """The surface with other openings, if there are any."""
+        lattice, count = surface.lattice, self.config.iterations
+        template = fit.scene.subject.surface_of(surface.fields, template=True)
+        vertices, faces, _ = template.to_numpy()
+        msdf = mi.Float(surface.fields.msdf)
+        values = template.interpolate(msdf).numpy() / lattice.spacing
+        mirrored = fit.judge.shown(positive_part(vertices, faces, values)).mirrored
+        appearance = SurfaceRadiance(vertices, faces, fit.views, fit.pixels, fit.config.radiance,
+                                     seed=fit.config.seed, mirrored=mirrored)
+        steps.run(OpacityTraining(appearance, self.config), count, {"radiance": appearance.optimizer})
+        with steps.task("verdict"):
+            normals = template.vertex_normals().numpy().T
+            side = loose_sheets(vertices, normals, faces, values <= 0, fit.cell(surface))
+            revised = _closed(fit, (vertices, faces), np.where(side, -1.0, values))
+            thin = np.isfinite(opposite_sides(vertices, vertices, faces, fit.cell(surface))[0])
+            revised = _opened(fit, (vertices, faces), revised, appearance.smoothed_logits(), thin)
+        changed = (revised <= 0) != (values <= 0)
+        steps.fact("openings_changed", bool(changed.any()))
+        if not changed.any():
+            return surface
+        smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
+        cut, near = reopened(lattice.spacing * values, revised <= 0, smooth, lattice.spacing)
+        msdf = rewritten(msdf, cut, near, template, lattice)
+        return replace(surface.with_fields(msdf=msdf.numpy()), settled=False)
+
+
+def _closed(fit: Fit, template: Mesh, values: np.ndarray) -> np.ndarray:
+    """(V,) values, those of openings negated whose caps explain unseen views better."""
+    opened = values <= 0
+    if not opened.any():
+        return values
+    place = places_of(opened, lobes(opened, template[1]))
+    now = fit.judge.shown(positive_part(*template, values))
+    capped = fit.judge.shown(template, like=now)
+    accepted = fit.judge.compare(now, capped, (template, place)).accepted
+    return np.where(opened & accepted[place], -values, values)
+
+
+def _opened(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.ndarray,
+            thin: np.ndarray) -> np.ndarray:
+    """(V,) values, negative also where unseen views are explained better without the surface.
+
+    Args:
+        fit: the views.
+        template: vertices and faces.
+        values: (V,) negative at its openings.
+        proposed: (V,) opacity logits.
+        thin: (V,) where the template's other side is within two cells.
+    """
+    vertices, faces = template
+    given = values <= 0
+    now = fit.judge.shown(positive_part(vertices, faces, values))
+
+    def clean(logits: np.ndarray) -> np.ndarray:
+        both = np.where(given, values, logits)
+        cleaned = clean_opacity(both, vertices, faces, fit.config.topology.min_area)
+        return np.where(given, values, close_shallow(np.where(given, 1.0, cleaned), faces, thin))
+
+    start = np.where(given, values, np.abs(proposed))
+    return justified(proposed, start, clean, lambda candidate: close_rejected(
+        candidate, template, fit.judge, now, given))

@@ -1,0 +1,75 @@
+"""What is open after all, and what is not, is told by the images on the surface that there is."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from silent_steps import Silent
+
+from gshell_mi.fit.stage import Fit
+from gshell_mi.fit.stages.hull import Hull
+from gshell_mi.fit.stages.revision import Revision
+from gshell_mi.topology import topology
+
+#: Fewer steps and pixels, as so small images need.
+SMALL = {"openings.iterations": 100, "radiance.batch": 16384, "radiance.smoothing": 8.0,
+         "openings.mask": 0.01, "openings.binary": 0.015, "openings.closing": 0.003}
+
+
+@pytest.fixture(scope="module")
+def fit(exact):
+    return Fit(exact.scene, exact.config.changed(SMALL), exact.lattices)
+
+
+@pytest.fixture(scope="module")
+def hull(fit):
+    """The bowl with a lid."""
+    return Hull(fit.config.hull).run(fit, None, Silent())
+
+
+@pytest.fixture(scope="module")
+def opened(fit, hull):
+    """What a revision makes of it, and whether it says so."""
+    return revised(fit, hull)
+
+
+def revised(fit, surface):
+    steps = Silent()
+    return Revision(fit.config.openings).run(fit, surface, steps), steps.facts["openings_changed"]
+
+
+def loops(fit, surface):
+    return topology(*fit.scene.subject.surface_of(surface.fields).to_numpy()[:2])
+
+
+def cut(fit, surface, cap):
+    """The surface with a hole: (N, 3) lattice vertices to (N,) whether they are cut."""
+    chosen = cap(surface.lattice.points(mi.Float).numpy().T)
+    msdf = np.where(chosen, -surface.lattice.spacing, surface.fields.msdf)
+    return surface.with_fields(msdf=msdf.astype(np.float32))
+
+
+def test_a_lid_opens(fit, hull, opened):
+    assert loops(fit, hull).boundary_loops == 0
+    found, changed = opened
+    assert changed and not found.settled
+    assert loops(fit, found).boundary_loops == 1 and loops(fit, found).components == 1
+    vertices = fit.scene.subject.surface_of(found.fields).to_numpy()[0]
+    assert vertices[:, 1].max() < 0.15 and vertices[:, 1].min() < -0.5
+
+
+def test_a_hole_closes_and_the_mouth_stays(fit, opened):
+    before, _ = opened
+    torn = cut(fit, before, lambda points: (points[:, 0] < -0.35) & (np.abs(points[:, 2]) < 0.3)
+               & (points[:, 1] < -0.05))
+    assert loops(fit, torn).boundary_length > 1.2 * loops(fit, before).boundary_length
+    mended, changed = revised(fit, torn)
+    assert changed
+    assert loops(fit, mended).boundary_loops == 1
+    assert loops(fit, mended).boundary_length == pytest.approx(loops(fit, before).boundary_length, rel=0.1)
+
+
+def test_what_is_right_stays(fit, opened):
+    before, _ = opened
+    again, _ = revised(fit, before)
+    assert loops(fit, again).boundary_loops == 1
+    assert loops(fit, again).boundary_length == pytest.approx(loops(fit, before).boundary_length, rel=0.05)
