@@ -32,6 +32,9 @@ from .openings import OpacityTraining, OpeningsConfig, justified
 #: Lambda that smooths new rims along the template.
 _SMOOTHING = 3.0
 
+#: Openings close together that are this near to the worst.
+_WORST = 0.5
+
 
 class Revision:
     """Opens and closes what the images justify by now."""
@@ -69,15 +72,20 @@ class Revision:
 
 
 def _closed(fit: Fit, template: Mesh, values: np.ndarray) -> np.ndarray:
-    """(V,) values, those of openings negated whose caps explain unseen views better."""
-    opened = values <= 0
-    if not opened.any():
-        return values
-    place = places_of(opened, lobes(opened, template[1]))
-    now = fit.judge.shown(positive_part(*template, values))
-    capped = fit.judge.shown(template, like=now)
-    accepted = fit.judge.compare(now, capped, (template, place)).accepted
-    return np.where(opened & accepted[place], -values, values)
+    """(V,) values, those of openings negated whose caps explain unseen views better.
+
+    Through one opening others are seen, so the worst close first.
+    """
+    while (values <= 0).any():
+        place = places_of(values <= 0, lobes(values <= 0, template[1]))
+        now = fit.judge.shown(positive_part(*template, values))
+        verdict = fit.judge.compare(now, fit.judge.shown(template, like=now), (template, place))
+        if not verdict.accepted.any():
+            break
+        gain = np.where(verdict.accepted, verdict.gain, 0)
+        closes = (place >= 0) & (gain >= _WORST * gain.max())[place]
+        values = np.where(closes, -values, values)
+    return values
 
 
 def _opened(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.ndarray,
