@@ -51,14 +51,9 @@ class ExplicitGrid(Parametrisation):
         return {name: mi.Float(dr.detach(optimizer[name]))
                 for optimizer in self.optimizers.values() for name in optimizer.keys()}
 
-    def replace(self, name: str, field: mi.Float) -> None:
-        self._optimizer_of(name)[name] = field
-
     def carry(self, carried: Carried) -> None:
         for optimizer in self.optimizers.values():
             carried.optimizer(optimizer, tuple(optimizer.keys()))
-        if self.frozen is not None:
-            self.frozen = carried.moments(self.frozen)
         self.lattice = carried.after
 
     def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
@@ -72,17 +67,11 @@ class ExplicitGrid(Parametrisation):
                  "weights": local}
         steps = {name: trusted(gradient) for name, gradient in gradients.items()}
         steps |= diffuse.together({name: steps[name] for name in steps if name in CHANNELS}, smoothing)
-        before = self.fields()
-        if self.frozen is not None:
-            # No momentum gathers meanwhile.
-            steps["msdf"] = dr.select(self.frozen, 0, steps["msdf"])
         for name, gradient in steps.items():
             dr.set_grad(self._optimizer_of(name)[name], gradient)
         for optimizer in self.optimizers.values():
             optimizer.set_learning_rate({name: decay * rates[name] for name in optimizer.keys()})
             optimizer.step()
-        if self.frozen is not None:
-            self.msdf_optimizer["msdf"] = dr.select(self.frozen, before["msdf"], self.msdf_optimizer["msdf"])
         if "deform" in gradients:
             self.optimizer["deform"] = dr.clip(self.optimizer["deform"], -1, 1)
 

@@ -54,9 +54,6 @@ class Parametrisation(ABC):
     moves_weights: bool = False
     """Whether the weights of FlexiCubes are among the fields that it is given in a fit."""
 
-    frozen: mi.Bool | None = None
-    """Lattice vertices where the mSDF stays as it is; None for none. Heeded where ``replace`` is."""
-
     @property
     @abstractmethod
     def optimizers(self) -> dict[str, mi.ad.Adam]:
@@ -65,10 +62,6 @@ class Parametrisation(ABC):
     @abstractmethod
     def fields(self) -> dict[str, mi.Float]:
         """The present fields, detached."""
-
-    def replace(self, name: str, field: mi.Float) -> None:
-        """Gives a field other values. Only where the values themselves are the parameters."""
-        raise NotImplementedError
 
     @abstractmethod
     def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,

@@ -7,9 +7,7 @@ import pytest
 
 from gshell_mi import CubeLattice, FlexiCubesLattice, TetLattice, UserError, extract
 from gshell_mi.extras import network
-from gshell_mi.fields.carried import Carried
 from gshell_mi.fit.bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
-from gshell_mi.lattice import MISSING, BlockLattice
 from gshell_mi.parametrisation import StepRules, make_parametrisation
 from gshell_mi.parametrisation.parametrisation import touched
 from gshell_mi.topology import topology
@@ -137,37 +135,6 @@ def test_kept_and_taken_up_again(name, monkeypatch):
         move(resumed, lattice, 0.2, iteration)
     for key, field in whole.fields().items():
         np.testing.assert_allclose(resumed.fields()[key].numpy(), field.numpy(), atol=2e-5)
-
-
-def test_what_is_held_stays_until_it_is_let_go():
-    lattice = TetLattice(8)
-    made = make_parametrisation("explicit", bowl(lattice), lattice)
-    msdf = made.fields()["msdf"].numpy()
-    pull = {name: dr.full(mi.Float, 1, dr.width(field)) for name, field in made.fields().items()}
-    made.step(pull, 0.0)    # momentum, too, leads nowhere
-    before, below = made.fields(), lattice.vertex_positions()[:, 2] < 0
-    made.frozen = mi.Bool(below)
-    for _ in range(3):
-        made.step(pull, 0.0)
-    moved = {name: made.fields()[name].numpy() - field.numpy() for name, field in before.items()}
-    np.testing.assert_array_equal(moved["msdf"] == 0, below)
-    assert (moved["sdf"] < 0).all()
-    made.frozen = None
-    made.step(pull, 0.0)
-    assert (made.fields()["msdf"].numpy() < msdf).all()
-
-
-def test_what_is_held_is_carried_to_other_blocks():
-    lattice = TetLattice(40)
-    before, after = (BlockLattice.around(lattice, lambda p, r=radius: dr.norm(p) - r, mi.Float)
-                     for radius in (0.3, 0.6))
-    made = make_parametrisation("explicit", bowl(before), before)
-    made.frozen = before.points(mi.Float).z < 0
-    made.carry(Carried(before, after))
-    frozen, below = made.frozen.numpy(), after.points(mi.Float).numpy()[2] < 0
-    stored = after.find_in(before).numpy() != MISSING
-    np.testing.assert_array_equal(frozen, below & stored)
-    assert 0 < frozen.sum() < below.sum()
 
 
 def test_broken_gradients_are_left_out():
