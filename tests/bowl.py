@@ -20,7 +20,7 @@ SHORT = ("--openings.iterations", "100", "--radiance.batch", "16384", "--radianc
          "--model.light-height", "8", "--no-report")
 
 #: Added to these where openings do not matter: hardly any steps, and the template stays closed.
-CLOSED = ("--openings.iterations", "5", "--openings.rounds", "0",
+CLOSED = ("--openings.iterations", "5", "--openings.rounds", "0", "--openings.no-revise",
           "--cavities.iterations", "4", "--refinement.iterations", "2")
 
 
