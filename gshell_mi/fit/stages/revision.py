@@ -58,8 +58,8 @@ class Revision:
         with steps.task("verdict"):
             normals = template.vertex_normals().numpy().T
             side = loose_sheets(vertices, normals, faces, values <= 0, fit.cell(surface))
-            revised = _closed(fit, (vertices, faces), np.where(side, -1.0, values))
             thin = np.isfinite(opposite_sides(vertices, vertices, faces, fit.cell(surface))[0])
+            revised = _closed(fit, (vertices, faces), np.where(side, -1.0, values), thin)
             revised = _opened(fit, (vertices, faces), revised, appearance.smoothed_logits(), thin)
         changed = (revised <= 0) != (values <= 0)
         steps.fact("openings_changed", bool(changed.any()))
@@ -71,20 +71,24 @@ class Revision:
         return replace(surface.with_fields(msdf=msdf.numpy()), settled=False)
 
 
-def _closed(fit: Fit, template: Mesh, values: np.ndarray) -> np.ndarray:
+def _closed(fit: Fit, template: Mesh, values: np.ndarray, thin: np.ndarray) -> np.ndarray:
     """(V,) values, those of openings negated whose caps explain unseen views better.
 
-    Through one opening others are seen, so the worst close first.
+    Through one opening others are seen, so the worst close first. Where a sheet has one side, its cap is a
+    cell from it, and looks alike.
+
+    Args:
+        fit, template, values, thin: as of ``_opened``.
     """
-    while (values <= 0).any():
-        place = places_of(values <= 0, lobes(values <= 0, template[1]))
+    while (opened := values <= 0).any():
+        place = places_of(opened, lobes(opened, template[1]))
         now = fit.judge.shown(positive_part(*template, values))
         verdict = fit.judge.compare(now, fit.judge.shown(template, like=now), (template, place))
-        if not verdict.accepted.any():
+        deep = 2 * np.bincount(place[opened], thin[opened]) <= np.bincount(place[opened])
+        gain = np.where(verdict.accepted & deep, verdict.gain, 0)
+        if not gain.any():
             break
-        gain = np.where(verdict.accepted, verdict.gain, 0)
-        closes = (place >= 0) & (gain >= _WORST * gain.max())[place]
-        values = np.where(closes, -values, values)
+        values = np.where(opened & (gain >= _WORST * gain.max())[place], -values, values)
     return values
 
 
