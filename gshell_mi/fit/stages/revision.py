@@ -55,12 +55,15 @@ class Revision:
         appearance = SurfaceRadiance(vertices, faces, fit.views, fit.pixels, fit.config.radiance,
                                      seed=fit.config.seed, mirrored=mirrored)
         steps.run(OpacityTraining(appearance, self.config), count, {"radiance": appearance.optimizer})
+        mesh, cell = (vertices, faces), fit.cell(surface)
         with steps.task("verdict"):
-            normals = template.vertex_normals().numpy().T
-            side = loose_sheets(vertices, normals, faces, values <= 0, fit.cell(surface))
-            thin = np.isfinite(opposite_sides(vertices, vertices, faces, fit.cell(surface))[0])
-            revised = _closed(fit, (vertices, faces), np.where(side, -1.0, values), thin)
-            revised = _opened(fit, (vertices, faces), revised, appearance.smoothed_logits(), thin)
+            proposed = appearance.smoothed_logits()
+            thickness, opposite = opposite_sides(vertices, vertices, faces, cell)
+            thin = np.isfinite(thickness)
+            revised = _closed(fit, mesh, values, proposed, np.where(thin, opposite, -1))
+            revised = _opened(fit, mesh, revised, proposed, thin)
+            side = loose_sheets(vertices, template.vertex_normals().numpy().T, faces, revised <= 0, cell)
+            revised = clean_opacity(np.where(side, -1.0, revised), *mesh, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
         steps.fact("openings_changed", bool(changed.any()))
         if not changed.any():
@@ -71,24 +74,31 @@ class Revision:
         return replace(surface.with_fields(msdf=msdf.numpy()), settled=False)
 
 
-def _closed(fit: Fit, template: Mesh, values: np.ndarray, thin: np.ndarray) -> np.ndarray:
-    """(V,) values, those of openings negated whose caps explain unseen views better.
+def _closed(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.ndarray,
+            opposite: np.ndarray) -> np.ndarray:
+    """(V,) values, those of openings negated that unseen views explain better as surface.
 
-    Through one opening others are seen, so the worst close first. Where a sheet has one side, its cap is a
-    cell from it, and looks alike.
+    First what the radiance shows to be opaque in them, such as islands; then all of an opening. Through one
+    opening others are seen, so the worst close first. Where a sheet has one side, what closes the other one
+    is a cell from it, and looks alike.
 
     Args:
-        fit, template, values, thin: as of ``_opened``.
+        fit, template, values, proposed: as of ``_opened``.
+        opposite: (V,) vertex on the template's other side, -1 if that is not near.
     """
-    while (opened := values <= 0).any():
-        place = places_of(opened, lobes(opened, template[1]))
-        now = fit.judge.shown(positive_part(*template, values))
-        verdict = fit.judge.compare(now, fit.judge.shown(template, like=now), (template, place))
-        deep = 2 * np.bincount(place[opened], thin[opened]) <= np.bincount(place[opened])
-        gain = np.where(verdict.accepted & deep, verdict.gain, 0)
-        if not gain.any():
-            break
-        values = np.where(opened & (gain >= _WORST * gain.max())[place], -values, values)
+    for closing in (proposed > 0, np.ones_like(values, bool)):
+        while (chosen := (values <= 0) & closing).any():
+            place = places_of(chosen, lobes(chosen, template[1]))
+            now = fit.judge.shown(positive_part(*template, values))
+            closed = np.where(chosen, np.abs(values), values)
+            after = fit.judge.shown(positive_part(*template, closed), like=now)
+            verdict = fit.judge.compare(now, after, (template, place))
+            backed = (opposite >= 0) & (values[opposite] > 0)
+            alone = 2 * np.bincount(place[chosen], backed[chosen]) <= np.bincount(place[chosen])
+            gain = np.where(verdict.accepted & alone, verdict.gain, 0)
+            if not gain.any():
+                break
+            values = np.where(chosen & (gain >= _WORST * gain.max())[place], -values, values)
     return values
 
 
