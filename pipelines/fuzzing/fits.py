@@ -142,8 +142,76 @@ def write_started_fit(folder: Path) -> None:
     try:
         fit_scene(scene, folder / "out", config=config, report=False, quiet=True, observer=_Stop())
     except _Stopped:
+        _find_of_views(folder / "out" / "checkpoint.npz")
         return
     raise AssertionError("the fit has not come to its joint stage")
+
+
+def _find_of_views(path: Path) -> None:
+    """Puts into a checkpoint what stages may have found of its views: gains, pixels to ignore, poses."""
+    from bowl import SIZE, VIEWS
+
+    from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+    from gshell_mi.packed_pixels import packed
+
+    checkpoint = Checkpoint.load(path)
+    ignored = np.zeros((SIZE, SIZE), bool)
+    ignored[:, :3] = True
+    checkpoint.arrays |= {"gains": np.full((VIEWS, 3), 1.1, np.float32), "ignored": packed([ignored] * VIEWS),
+                          "poses": np.full((VIEWS, 6), 1e-3)}
+    checkpoint.save(path)
+
+
+def write_views_in_doubt(folder: Path) -> None:
+    """A scene of few pixels, of some of which nothing is known."""
+    from bowl import SIZE, write_fit_scene
+
+    scene = write_fit_scene(folder)
+    text = scene.read_text(encoding="utf-8").replace(f'value="{SIZE}"', 'value="12"')
+    scene.write_text(text.replace('value="20"', 'value="8"'), encoding="utf-8")
+    known = np.ones((12, 12, 1), np.float32)
+    known[:, :2] = 0.5
+    for path in sorted(scene.with_suffix("").glob("*.exr")):
+        small = np.array(mi.Bitmap(str(path))).reshape(12, SIZE // 12, 12, SIZE // 12, 4).mean(axis=(1, 3))
+        mi.Bitmap(small.astype(np.float32)).write(str(path))
+        mi.Bitmap(known, mi.Bitmap.PixelFormat.Y).write(str(path.with_suffix(".known.exr")))
+
+
+def fit(folder: Path) -> None:
+    """The command, with every stage that judges views."""
+    from gshell_mi.fit.__main__ import main
+
+    command(main, folder / "bowl.xml", "-o", folder / "out", "--quiet", *_short(), "--occlusion.most", "0.3",
+            "--detail.iterations", "1", "--poses", "refine", "--exposures", "find")
+
+
+def damage_pixels(path: Path, random: Random) -> None:
+    """Damages a file, or writes another picture that a camera or a mask may have given."""
+    if random.random() < 0.1:
+        damage_file(path, random)
+        return
+    pixels = np.array(mi.Bitmap(str(path)))
+    pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.float32)
+    alpha, kind = pixels[..., -1:], random.randrange(8)
+    if kind == 0:
+        pixels[...] = random.choice((0.0, 1.0, 1e-30, 0.5))
+    elif kind == 1:
+        alpha[...] = random.choice((0.0, 1.0, 0.4999))
+    elif kind == 2:
+        pixels[..., :-1] *= random.choice((0.0, -1.0, 1e-20, 1e4, 1e30))
+    elif kind == 3:
+        pixels[random.randrange(len(pixels)), random.randrange(len(pixels))] = random.choice(
+            (0.0, 1.0, -1.0, 1e38, np.nan, np.inf))
+    elif kind == 4:
+        pixels[...] = np.random.default_rng(random.randrange(2**32)).random(pixels.shape)
+    elif kind == 5:
+        pixels[...] = pixels[::-1].copy()
+    elif kind == 6:
+        alpha[:, random.randrange(len(pixels)):] = random.choice((0.0, 1.0))
+    else:
+        pixels[...] = np.roll(pixels, random.randrange(1, len(pixels)), axis=random.randrange(2))
+    kinds = {1: mi.Bitmap.PixelFormat.Y, 4: mi.Bitmap.PixelFormat.RGBA}
+    mi.Bitmap(pixels, kinds[pixels.shape[2]]).write(str(path))
 
 
 def resume(folder: Path) -> None:
