@@ -169,6 +169,29 @@ def test_byte_order_mark(model):
     assert len(read_capture(model).frames) == len(CAMERAS)
 
 
+def test_lines_of_images_that_end_in_another_way(model):
+    """Spaces after a name, and the line ends of Windows and of old Macs."""
+    path = model / "sparse" / "0" / "images.txt"
+    text, before = path.read_text(encoding="utf-8"), read_capture(model).frames
+    for end in ("  \n", "\r\n", "\r"):
+        path.write_bytes(text.replace("\n", end).encode())
+        assert [frame.image for frame in read_capture(model).frames] == [frame.image for frame in before]
+
+
+@pytest.mark.parametrize("edit, words", [
+    (lambda words: [words[0], "0", "0", "0", "0", *words[5:]], "The pose of image '.*' of "),
+    (lambda words: [*words[:9], "IMG 00.png"], "images.txt' has the image 'IMG 00.png' twice"),
+])
+def test_images_that_no_model_has(edit, words, model):
+    path = model / "sparse" / "0" / "images.txt"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    images = [number for number, line in enumerate(lines) if line.count(" ") >= 9 and line[0] != "#"]
+    lines[images[1]] = " ".join(edit(lines[images[1]].split(" ")))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with pytest.raises(UserError, match=words):
+        read_capture(model)
+
+
 def test_widths_of_hundreds_of_digits(model):
     path = model / "sparse" / "0" / "cameras.txt"
     path.write_text(path.read_text(encoding="utf-8").replace(" 16 12 ", f" {'9' * 400} 12 ", 1),
