@@ -177,12 +177,29 @@ def write_views_in_doubt(folder: Path) -> None:
         mi.Bitmap(known, mi.Bitmap.PixelFormat.Y).write(str(path.with_suffix(".known.exr")))
 
 
-def fit(folder: Path) -> None:
-    """The command, with every stage that judges views."""
-    from gshell_mi.fit.__main__ import main
+def judge_views(folder: Path) -> None:
+    """The stages that judge views, as a fit runs them, one after another."""
+    from silent_steps import Silent
 
-    command(main, folder / "bowl.xml", "-o", folder / "out", "--quiet", *_short(), "--occlusion.most", "0.3",
-            "--detail.iterations", "1", "--poses", "refine", "--exposures", "find")
+    from gshell_mi.fit.config import FitConfig
+    from gshell_mi.fit.lattices import Lattices
+    from gshell_mi.fit.stage import Fit
+    from gshell_mi.fit.stages.exposures import Exposures
+    from gshell_mi.fit.stages.hull import Hull
+    from gshell_mi.fit.stages.occlusion import Occlusion
+    from gshell_mi.fit.stages.poses import Poses
+    from gshell_mi.fit.surface import Surface
+    from gshell_mi.scene import load_fit_scene
+
+    config = FitConfig().changed({"radiance.batch": 1024, "occlusion.most": 0.2, "occlusion.levels": 2,
+                                  "cameras.places": 500, "gains.places": 100})
+    scene = load_fit_scene(folder / "bowl.xml")
+    given = Fit(scene, config, Lattices.of(scene.subject, config))
+    surface = Surface(scene.subject.fields())
+    for stage in (Occlusion(config.occlusion), Hull(config.hull), Exposures(config.gains),
+                  Poses(config.cameras)):
+        surface = stage.run(given.corrected(surface), surface, Silent()).after(surface)
+    given.corrected(surface)
 
 
 def damage_pixels(path: Path, random: Random) -> None:

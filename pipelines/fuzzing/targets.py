@@ -16,7 +16,7 @@ from .fits import (
     damage_state,
     export,
     film,
-    fit,
+    judge_views,
     load_checkpoint,
     report,
     resume,
@@ -232,6 +232,6 @@ TARGETS = {
     "checkpoint": Target(write_checkpoint, load_checkpoint, "*.npz"),
     "resume": Target(write_started_fit, resume, "out/checkpoint.npz", "out/log.jsonl", "out/gshell_mi.json",
                      keeps="out/", damage=damage_state),
-    "fit": Target(write_views_in_doubt, fit, "view_*.exr", keeps="out/", damage=damage_pixels),
+    "views": Target(write_views_in_doubt, judge_views, "view_*.exr", damage=damage_pixels),
     "light": Target(_map, _light, "map.*"),
 }
