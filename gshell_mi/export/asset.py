@@ -58,7 +58,7 @@ class AssetConfig:
             raise UserError(f"--texture-size must be at least 16 pixels, not {self.texture_size}.")
         memory.require(_PER_TEXEL * self.texture_size**2, memory.free_memory(),
                        f"Textures of {self.texture_size} pixels per side", "lower --texture-size")
-        if not 0 < self.unwrap_seconds < _LONGEST:
+        if not 0 <= self.unwrap_seconds < _LONGEST:
             raise UserError(f"--unwrap-seconds lies between 0 and {_LONGEST}, unlike "
                             f"{self.unwrap_seconds:g}.")
         if self.face_count < 0:
