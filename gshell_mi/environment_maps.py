@@ -12,7 +12,8 @@ from .float_images import first_not_finite, read_float_image
 
 
 def read_environment_map(path: Path, name: str) -> np.ndarray:
-    """(height, width, 3) linear radiance of a latitude-longitude map; alpha is left out, grey repeated.
+    """(height, width, 3) linear radiance of a latitude-longitude map; alpha is left out, grey repeated, and
+    negative values, which filters leave beside a sun, are 0.
 
     Args:
         path: an OpenEXR file, or another image that Mitsuba reads.
@@ -34,7 +35,7 @@ def read_environment_map(path: Path, name: str) -> np.ndarray:
         raise UserError(f"{name} '{path}' holds NaN or infinity (first at column {bad[0]}, row {bad[1]}); "
                         f"mend those pixels, or clamp a sun beyond what half floats hold.")
     color = pixels[..., :3] if channels.startswith("RGB") else np.repeat(pixels[..., :1], 3, axis=-1)
-    return np.ascontiguousarray(color)
+    return np.maximum(color, 0)
 
 
 def environment_emitter(path: Path, name: str) -> mi.Emitter:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from .files import replacing
 
@@ -66,7 +67,14 @@ def mask_overlay(target: np.ndarray, fit: np.ndarray, known: np.ndarray) -> np.n
     return overlay
 
 
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Writes (h, w, 3) sRGB values in [0, 1]."""
+def write_png(path: Path, image: np.ndarray, *, comment: str = "") -> None:
+    """Writes (h, w, 3) sRGB values in [0, 1].
+
+    Args:
+        comment: a word in the file, such as who wrote it.
+    """
+    text = PngInfo()
+    if comment:
+        text.add_text("Software", comment)
     with replacing(path) as partial:
-        Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)).save(partial)
+        Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)).save(partial, pnginfo=text)

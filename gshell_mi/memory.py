@@ -19,6 +19,9 @@ _CGROUPS = Path("/sys/fs/cgroup")
 
 GIB = 2**30
 
+#: Bytes per sample of a rendered image, and the longest paths that Mitsuba's integers count.
+PER_SAMPLE, LONGEST_PATH = 50, 2**31 - 1
+
 
 class _Interface(NamedTuple):
     """Where a version of Linux's control groups tells what."""
@@ -74,6 +77,11 @@ are free; lower its resolution.
     if free is not None and needed > free:
         raise UserError(f"{what} needs about {needed / GIB:.1f} GiB of memory, and {free / GIB:.1f} GiB are "
                         f"free; {cure}.")
+
+
+def require_for_image(width: int, height: int, spp: int, what: str, cure: str) -> None:
+    """Refuses an image whose samples do not fit into the memory of the current variant, as ``require``."""
+    require(PER_SAMPLE * width * height * spp, free_memory_of_variant(), what, cure)
 
 
 def _available() -> int | None:

@@ -230,11 +230,15 @@ def is_own_file(path: Path) -> bool:
         return TAG.encode() in start or TAG.encode() in file.read()
 
 
-def check_own_file(path: Path) -> None:
-    """Raises ``UserError`` if there is something at ``path`` that is no file of ours."""
+def check_own_file(path: Path, *, option: str = "-o") -> None:
+    """Raises ``UserError`` if there is something at ``path`` that is no file of ours.
+
+    Args:
+        option: that names another place.
+    """
     if os.path.lexists(path) and not is_own_file(path):
         raise UserError(f"'{path}' exists and was not written by gshell_mi, so it is left alone; move it "
-                        f"away or choose another file with -o.")
+                        f"away or choose another place with {option}.")
 
 
 def remove_empty(folder: Path) -> None:

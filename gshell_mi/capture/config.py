@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import UserError
+from ..lattice import MOST_CELLS
 
 #: What --up may name beside "auto", "cameras" and "keep".
 AXES = {sign + name: tuple((-1.0 if sign else 1.0) * (axis == index) for index in range(3))
@@ -77,8 +78,11 @@ class CaptureConfig:
             raise UserError(f"--max-size must not be negative, and is {self.max_size}.")
         if self.hold_out < 0 or self.hold_out == 1:
             raise UserError(f"--hold-out must be 0 or at least 2, not {self.hold_out}.")
-        if self.resolution < 4:
-            raise UserError(f"--resolution must be at least 4 cells, not {self.resolution}.")
+        if not 4 <= self.resolution <= MOST_CELLS:
+            raise UserError(f"--resolution must be from 4 to {MOST_CELLS} cells, not {self.resolution}.")
+        if not (math.isfinite(self.background_tolerance) and self.background_tolerance >= 0):
+            raise UserError(f"--background-tolerance must be a number that is not negative, unlike "
+                            f"{self.background_tolerance:g}.")
         if self.up not in (*AXES, "auto", "cameras", "keep"):
             raise UserError(f"--up '{self.up}' is unknown; choose {', '.join(AXES)}, cameras, keep or auto.")
         if self.make_masks not in ("grabcut", "rembg", "off"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import lru_cache
@@ -11,26 +12,49 @@ from .decoding import SUFFIXES
 
 
 def existing(named: Path) -> Path | None:
-    """The file of that name, or the one that differs in the suffix only: left out, or in another case."""
+    """The file of that name, or the one that differs in the suffix only: left out, or in another case.
+
+    Names are equal if they are so to a reader: some systems keep accents apart from their letters.
+    """
     try:
         if named.is_file():
             return named
         # Blender's sets leave the suffix out; a name's own dots are no suffix.
         completed = (named.with_name(named.name + suffix) for suffix in SUFFIXES) if named.name else ()
         found = next((file for file in completed if file.is_file()), None)
-        if found is not None or not named.parent.is_dir():
+        if found is not None or not named.name or (folder := _existing_folder(named.parent)) is None:
             return found
-        there = _by_lower_suffix(str(named.parent), named.parent.stat().st_mtime_ns)
+        there = _by_spelling(str(folder), folder.stat().st_mtime_ns)
     except (OSError, ValueError):    # names that cannot be a file's
         return None
-    keys = [named.stem + named.suffix.lower(), *(named.name + suffix for suffix in SUFFIXES)]
-    return next((named.parent / there[key] for key in keys if key in there), None)
+    keys = [_spelling(named.name), *(_spelling(named.name + suffix) for suffix in SUFFIXES)]
+    return next((folder / there[key] for key in keys if key in there), None)
+
+
+def _existing_folder(named: Path) -> Path | None:
+    if named.is_dir():
+        return named
+    parent = _existing_folder(named.parent) if named.parent != named else None
+    if parent is None or named.name.isascii():
+        return None
+    return next((folder for folder in sorted(parent.iterdir())
+                 if folder.is_dir() and _composed(folder.name) == _composed(named.name)), None)
 
 
 @lru_cache(maxsize=16)
-def _by_lower_suffix(folder: str, changed: int) -> dict[str, str]:
+def _by_spelling(folder: str, changed: int) -> dict[str, str]:
     names = sorted(file.name for file in Path(folder).iterdir() if file.is_file())
-    return {Path(name).stem + Path(name).suffix.lower(): name for name in reversed(names)}
+    return {_spelling(name): name for name in reversed(names)}
+
+
+def _spelling(name: str) -> str:
+    """A name with a suffix in small letters, and as ``_composed``."""
+    return _composed(Path(name).stem + Path(name).suffix.lower())
+
+
+def _composed(name: str) -> str:
+    """A name whose accents are on their letters."""
+    return unicodedata.normalize("NFC", name)
 
 
 class Copies:

@@ -168,7 +168,10 @@ def mask_values(path: Path) -> np.ndarray:
     # Some tools put the mask into alpha and leave the colour empty or as it was.
     in_alpha = mask.shape[2] == 4 and _unit(mask[..., 3]).min() < 1
     values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
-    return np.clip(_unit(values, mask.dtype), 0, 1)
+    values = _unit(values, mask.dtype)
+    if mask.dtype.kind == "f" and (top := float(values.max(initial=0))) >= 2:
+        values = values / (255 if top <= 255 else 65535)    # what integers held
+    return np.clip(values, 0, 1)
 
 
 def alpha_values(pixels: np.ndarray) -> np.ndarray | None:

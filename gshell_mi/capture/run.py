@@ -125,8 +125,8 @@ class _Import:
                                        white, ignored_white_of(self.capture.frames))
         self.warnings = [*capture.notes, *_profile_warning(capture, config)]
         if white < 1:
-            self.warnings.append(f"The largest value of the masks is {255 * white:.3g} of 255 ({white:.2g}); "
-                                 f"it is taken for white, which is 1.")
+            self.warnings.append(f"The object's value in the masks is {255 * white:.3g} of 255 "
+                                 f"({white:.2g}); it is taken for white, which is 1, and so are larger ones.")
         if given:
             self.capture, turned = with_turned_masks(self.capture, white, config.invert_masks)
             self.warnings += turned

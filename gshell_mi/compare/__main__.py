@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from rich.table import Table
 from ..command_line import run_command
 from ..errors import UserError
 from ..evaluation import IMAGE_SCORES, Scores
-from ..files import replacing
+from ..evaluation.scores_file import check_scores_file, write_scores
 from ..wording import counted
 
 _MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
@@ -39,9 +38,9 @@ class _Arguments:
     spp: int = 64
     """Of a fit: samples per pixel."""
     json: Path | None = None
-    """File for the scores."""
+    """File for the scores; one of an earlier comparison is replaced."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder for error images: reference, result and FLIP map side by side."""
+    """Folder for error images: reference, result and FLIP map side by side; earlier ones are replaced."""
     variant: str = "llvm_ad_rgb"
     """Mitsuba variant: llvm_ad_rgb (CPU) or cuda_ad_rgb (NVIDIA GPU)."""
 
@@ -54,15 +53,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _score(given: _Arguments) -> None:
     try:
-        if given.json and given.json.exists() and any(
-                path and path.exists() and path.samefile(given.json) for path in (given.first, given.second)):
-            raise UserError(f"'{given.json}' is compared, and --json would replace it; choose another file.")
+        if given.json:
+            check_scores_file(given.json)
         result = _compare(given)
         if given.json:
-            with replacing(given.json) as partial:
-                partial.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+            write_scores(given.json, result)
     except OSError as error:
-        raise UserError(f"'{error.filename or given.json or given.output}' cannot be written "
+        raise UserError(f"'{error.filename or given.output}' cannot be written "
                         f"({error.strerror or error}); choose another place.") from error
     unmatched = result.get("unmatched")
     if unmatched:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
+from .. import memory
 from ..errors import UserError
 from ..evaluation import Scores, albedo_scale, image_scores, mean_scores, mesh_scores, read_image
 from ..evaluation.mesh_scores import read_mesh
 from ..export.fitted_scene import load_fitted_scene
+from ..files import name_trouble
 from ..images import over_white, write_png
 from ..json_files import read_json_object
+from ..own_folder import TAG, check_own_file
 from ..scene_files import load_scene
 from ..targets import load_target
 
@@ -26,15 +29,17 @@ def compare_folders(first: Path, second: Path, errors: Path | None = None) -> di
     Args:
         first: what is judged.
         second: the reference.
-        errors: folder for the FLIP maps (magma).
+        errors: folder for the FLIP maps (magma); of files in it, those of earlier comparisons are replaced.
 
     Returns:
         ``views`` (scores by name), ``mean`` and ``unmatched``, the names in only one of the folders.
 
     Raises:
-        UserError: a path is missing, the folders share no file, or images do not fit together.
+        UserError: a path is missing, the folders share no file, images do not fit together, or another's
+            file is in the place of a map.
     """
     pairs, unmatched = _pairs(Path(first), Path(second))
+    _check_free(errors, pairs)
     views = {}
     for name, (image, reference) in pairs.items():
         views[name] = _score(name, read_image(image), read_image(reference), errors)
@@ -60,7 +65,7 @@ def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | No
             ``albedo_scale`` (``mean_albedo_scaled``).
         mesh: the true surface, to score the geometry too.
         spp: samples per pixel.
-        errors: folder for the FLIP maps (magma).
+        errors: folder for the FLIP maps (magma); of files in it, those of earlier comparisons are replaced.
         progress: called with (views done, views).
 
     Returns:
@@ -75,6 +80,9 @@ def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | No
     cameras = load_scene(sensors).sensors() if sensors else scene.sensors()
     if not cameras:
         raise UserError(f"'{sensors}' has no sensors; give a scene file with some.")
+    _check_free(errors, [camera.id() for camera in cameras])
+    width, height = np.max([camera.film().crop_size() for camera in cameras], axis=0)
+    memory.require_for_image(int(width), int(height), spp, "A view", "lower --spp")
     references = [load_target(targets / f"{camera.id()}.exr", *camera.film().crop_size()).rgba
                   for camera in cameras]
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
@@ -134,5 +142,15 @@ def _score(name: str, image: np.ndarray, reference: np.ndarray, errors: Path | N
         raise UserError(f"'{name}': {error}") from error
     if errors:
         errors.mkdir(parents=True, exist_ok=True)
-        write_png(errors / f"{name}.png", np.concatenate([over_white(reference), over_white(image), flip], 1))
+        write_png(errors / f"{name}.png", np.concatenate([over_white(reference), over_white(image), flip], 1),
+                  comment=TAG)
     return scores
+
+
+def _check_free(errors: Path | None, names: Iterable[str]) -> None:
+    """Refuses names that are no files', and files of somebody else where error images would be."""
+    for name in names if errors else ():
+        if trouble := name_trouble(name, in_scene=False):
+            raise UserError(f"The name '{name[:80]}' {trouble}, so no error image can have it; rename it or "
+                            f"leave out -o.")
+        check_own_file(Path(errors or ".") / f"{name}.png")

@@ -12,6 +12,9 @@ import tyro
 from ..command_line import run_command
 from ..errors import UserError
 
+#: Beyond, the list of them alone fills memory.
+_MOST_GARMENTS = 1_000_000
+
 
 @dataclass(frozen=True)
 class _Arguments:
@@ -45,6 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _make(given: _Arguments) -> None:
+    from ..generation.checks import check_positive
     from ..generation.making import make_data_set
 
     for place in given.sources:
@@ -55,6 +59,9 @@ def _make(given: _Arguments) -> None:
     if given.garments < 0 or not (given.sources or given.garments):
         raise UserError("There is nothing to make a data set of; name folders of meshes, or a number of "
                         "--garments.")
+    if given.garments > _MOST_GARMENTS:
+        raise UserError(f"--garments must be at most {_MOST_GARMENTS}, not {given.garments}.")
+    check_positive("--max-chamfer", given.max_chamfer)
     if given.side % 8 or not 16 <= given.side <= 256:
         raise UserError(f"--side must be a multiple of 8 from 16 to 256, not {given.side}.")
     if not 0 <= given.held_out < 1:

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from .. import memory
 from ..errors import UserError
 from ..files import replacing
 from ..own_folder import own_folder
@@ -24,6 +25,12 @@ from .stock_scene import up_axis
 #: What ``AssetConfig.obj`` adds.
 _OBJ_FILES = ("mesh.obj", "mesh.mtl", "mesh_base_color.png", "mesh_roughness.png", "mesh_metallic.png",
               "mesh_normal.png")
+
+#: Bytes that a texel takes: its colour, roughness, metallic and normal, and what they are baked from.
+_PER_TEXEL = 100
+
+#: Seconds; what waits for another process counts no longer.
+_LONGEST = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,11 @@ class AssetConfig:
     def __post_init__(self) -> None:
         if self.texture_size < 16:
             raise UserError(f"--texture-size must be at least 16 pixels, not {self.texture_size}.")
+        memory.require(_PER_TEXEL * self.texture_size**2, memory.free_memory(),
+                       f"Textures of {self.texture_size} pixels per side", "lower --texture-size")
+        if not 0 <= self.unwrap_seconds < _LONGEST:
+            raise UserError(f"--unwrap-seconds lies between 0 and {_LONGEST}, unlike "
+                            f"{self.unwrap_seconds:g}.")
         if self.face_count < 0:
             raise UserError(f"--face-count must not be negative, and is {self.face_count}.")
         if not 0 <= self.min_quality < 1:

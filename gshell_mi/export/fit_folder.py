@@ -50,7 +50,8 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
     Returns:
         The metrics, which ``write_metrics`` stores.
     """
-    chosen = np.unique(np.linspace(0, len(fit.sensors) - 1, views).round().astype(int))
+    count = len(fit.sensors)
+    chosen = np.unique(np.linspace(0, count - 1, min(views, count)).round().astype(int))
     shown = {TRAINING: [fit.training[index] for index in chosen], HELD_OUT: fit.held_out}
     names = [[view.sensor.id() for view in group] for group in shown.values()]
     OwnFolder(output, "fit").claim("mesh.ply", "template.ply", "light.exr", "scene.xml", *view_files(*names))

@@ -12,7 +12,8 @@ import numpy as np
 
 from .. import memory
 from ..errors import UserError
-from ..lattice import BlockLattice, Lattice, block_count, lattice_of, make_lattice
+from ..files import replacing
+from ..lattice import MOST_CELLS, BlockLattice, Lattice, block_count, lattice_of, make_lattice
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 _FIXED_POINT_STEPS = 4
 #: What a file may hold; the first four are values, the rest say where they belong.
 _ARRAYS = ("sdf", "msdf", "deform", "weights", "blocks", "block_resolution")
-#: Cells per side in a file; beyond, vertices could not be numbered.
-_MOST_CELLS = 800
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,8 @@ class LatticeFields:
         others: dict[str, Any] = {} if self.weights is None else {"weights": self.weights}
         if self.blocks is not None:
             others |= {"blocks": self.blocks, "block_resolution": np.array(self.block_resolution)}
-        with open(path, "wb") as file:  # a file object, as NumPy would append .npz to other names
+        # A file object, as NumPy would append .npz to other names.
+        with replacing(Path(path)) as partial, open(partial, "wb") as file:
             np.savez_compressed(file, sdf=self.sdf, msdf=self.msdf, deform=self.deform, **others)
 
     @classmethod
@@ -207,8 +207,8 @@ def _arrays_of(path: str | Path) -> dict[str, np.ndarray]:
 def _checked_blocks(arrays: dict[str, np.ndarray], grid: str, path: str | Path) -> tuple[np.ndarray, int]:
     """The numbers of blocks and the cells per side of their lattice, for which nothing else may pass."""
     blocks, resolution = arrays["blocks"], arrays.get("block_resolution", np.zeros(1))
-    if resolution.size != 1 or resolution[0] not in range(1, _MOST_CELLS + 1):
-        raise UserError(f"{path}: has blocks, but no block_resolution from 1 to {_MOST_CELLS}")
+    if resolution.size != 1 or resolution[0] not in range(1, MOST_CELLS + 1):
+        raise UserError(f"{path}: has blocks, but no block_resolution from 1 to {MOST_CELLS}")
     count = block_count(make_lattice(grid, int(resolution[0])))
     if len(blocks) == 0 or (np.diff(blocks) <= 0).any() or (blocks % 1).any() or blocks[0] < 0 or (
             blocks[-1] >= count):

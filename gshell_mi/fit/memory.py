@@ -24,7 +24,9 @@ _PER_VOTE = 4  # ... what it keeps there per view that has to see daylight
 _PER_SQUARE_CELL = 37_000  # resolution squared, as the surface grows: meshes, edge lists, derivatives
 _PER_WEIGHT = 20  # of FlexiCubes, if they are optimised: its gradient and Adam's moments, too ...
 _WEIGHTS_PER_SQUARE_CELL = 900  # ... where only blocks around the surface have some
-_PER_SAMPLE = 50  # of a rendered image
+_PER_RAY = 300  # that a step of the stages up to the volume follows
+_PER_TEXEL = 100  # of the light: its values, gradient, Adam's moments and the table it is sampled by
+_PER_PLACE = 500  # of the surface that poses compare: where it is, and what each view sees there
 _PER_SQUARE_VOXEL = 19_000  # of the radiance volume's side squared: a tablecloth fills 57 voxels each, of 340
 
 
@@ -39,6 +41,8 @@ class MemoryEstimate:
         targets: the images.
         samples: one rendered view.
         volume: the radiance volume, gone before the samples come.
+        rays: those that a step follows at once, and places that are compared.
+        light: the environment map.
     """
 
     program: int
@@ -47,6 +51,8 @@ class MemoryEstimate:
     targets: int
     samples: int
     volume: int
+    rays: int
+    light: int
 
     @classmethod
     def of(cls, config: FitConfig, resolution: int, sizes: np.ndarray, *,
@@ -81,12 +87,16 @@ class MemoryEstimate:
             hull=int((_PER_HULL_SAMPLE + _PER_VOTE * votes) * hull_samples),
             lattice=_PER_VERTEX * vertices + _PER_SQUARE_CELL * resolution**2 + _PER_WEIGHT * weights,
             targets=(_PER_PIXEL + corrected) * int(pixels.sum()),
-            samples=_PER_SAMPLE * int(pixels.max()) * max(config.render.primal_spp, config.render.spp),
-            volume=_PER_SQUARE_VOXEL * config.volume.side**2 if config.volume.iterations else 0)
+            samples=memory.PER_SAMPLE * int(pixels.max()) * max(config.render.primal_spp, config.render.spp),
+            volume=_PER_SQUARE_VOXEL * config.volume.side**2 if config.volume.iterations else 0,
+            rays=max(_PER_RAY * config.radiance.batch, _PER_RAY * config.cavities.batch,
+                     _PER_RAY * config.volume.batch, _PER_PLACE * config.cameras.places),
+            light=_PER_TEXEL * 2 * config.model.light_height**2)
 
     @property
     def total(self) -> int:
-        return self.program + self.targets + max(self.hull, self.volume, self.lattice + self.samples)
+        joint = self.lattice + self.samples + self.light
+        return self.program + self.targets + max(self.hull, self.volume, self.rays, joint)
 
     def require(self, free: int | None) -> None:
         """Refuses, by a ``UserError`` that says what to lower, a fit that needs more than ``free`` bytes."""
@@ -96,6 +106,8 @@ class MemoryEstimate:
             "lattice": "lower --resolution",
             "targets": "use fewer or smaller views (--max-size of the import)",
             "volume": "lower --volume.side",
+            "rays": "lower --radiance.batch, --cavities.batch, --volume.batch and --cameras.places",
+            "light": "lower --model.light-height",
             "samples": "lower --render.primal-spp and --render.spp, or use smaller views (--max-size of the "
                        "import)",
         }

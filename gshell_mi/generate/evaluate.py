@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from rich.table import Table
 
 from ..command_line import run_command
 from ..errors import UserError
-from ..files import replacing
+from ..evaluation.scores_file import check_scores_file, write_scores
 
 _MEANINGS = {
     "mmd": "mean distance from a true shape to the nearest sample",
@@ -38,7 +37,7 @@ class _Arguments:
     emd: int = 32
     """Shapes of each set for the earth mover's distance; 0 for none."""
     json: Path | None = None
-    """File for the scores."""
+    """File for the scores; one of an earlier evaluation is replaced."""
     quiet: bool = False
     """No progress bar."""
 
@@ -59,12 +58,13 @@ def _evaluate(given: _Arguments) -> None:
         raise UserError(f"--points must be from 16 to 2048, not {given.points}.")
     if given.emd < 0:
         raise UserError(f"--emd must not be negative, but is {given.emd}.")
+    if given.json:
+        check_scores_file(given.json)
     data = DataSet.open(given.data_set)
     scores = evaluate(read_samples(given.samples, given.points), data, points=given.points, emd=given.emd,
                       quiet=given.quiet)
     if given.json:
-        with replacing(given.json) as partial:
-            partial.write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
+        write_scores(given.json, scores)
     table = Table("score", "", "")
     for name, value in scores.items():
         shown = "" if value is None else f"{value:.4f}" if isinstance(value, float) else str(value)

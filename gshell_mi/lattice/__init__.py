@@ -4,6 +4,7 @@ from .block_lattice import BlockLattice, block_count
 from .lattice import (
     GRIDS,
     MISSING,
+    MOST_CELLS,
     BccLattice,
     CubeLattice,
     CubicGrid,
@@ -15,5 +16,6 @@ from .lattice import (
     make_lattice,
 )
 
-__all__ = ["GRIDS", "MISSING", "BccLattice", "BlockLattice", "CubeLattice", "CubicGrid", "FlexiCubesLattice",
-           "Lattice", "TetLattice", "array_type", "block_count", "lattice_of", "make_lattice"]
+__all__ = ["GRIDS", "MISSING", "MOST_CELLS", "BccLattice", "BlockLattice", "CubeLattice", "CubicGrid",
+           "FlexiCubesLattice", "Lattice", "TetLattice", "array_type", "block_count", "lattice_of",
+           "make_lattice"]

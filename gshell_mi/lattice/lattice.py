@@ -10,6 +10,9 @@ import numpy as np
 from ..arrays import AnyArray, Array3f, Field, Float, UInt32
 from ..errors import UserError
 
+#: Cells per side; beyond, vertices could not be numbered.
+MOST_CELLS = 800
+
 #: Stands for a vertex that does not exist.
 MISSING = 0xFFFFFFFF
 
@@ -61,7 +64,7 @@ class Lattice:
     differ in how a surface is extracted from fields on them; only ``BccLattice`` has other vertices too.
 
     Raises:
-        UserError: the resolution is not between 1 and 800.
+        UserError: the resolution is not between 1 and ``MOST_CELLS``.
 
     >>> lattice = TetLattice(2)
     >>> lattice.vertex_count, lattice.spacing
@@ -91,9 +94,9 @@ class Lattice:
     resolution: int
 
     def __post_init__(self) -> None:
-        if not 1 <= self.resolution <= 800:
+        if not 1 <= self.resolution <= MOST_CELLS:
             raise UserError(
-                f"lattice resolution must be between 1 and 800 cells per side, not {self.resolution}"
+                f"lattice resolution must be between 1 and {MOST_CELLS} cells per side, not {self.resolution}"
             )
 
     @property

@@ -54,7 +54,8 @@ def correction_rows(metrics: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
 def training_pictures(folder: Path, count: int, metrics: dict) -> list[dict]:
     """Target, fit and error of up to ``count`` training views, spread evenly, as data URLs."""
     paths = sorted((folder / TRAINING).glob("*.png"))
-    chosen = np.unique(np.linspace(0, len(paths) - 1, count).round().astype(int)) if paths else []
+    spread = np.linspace(0, max(len(paths) - 1, 0), min(count, len(paths)))
+    chosen = np.unique(spread.round().astype(int))
     shown = []
     for path in (paths[i] for i in chosen):
         target, fit, error = map(image_url, np.split(_triptych(path), 3, axis=1))

@@ -9,6 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from .. import memory
 from ..errors import UserError
 from ..export.fitted_scene import load_fitted_scene
 from ..export.ply import read_ply
@@ -55,8 +56,9 @@ class TurntableConfig:
             raise UserError(f"--fps lies between 0 and 120, unlike {self.fps:g}.")
         if not -89 <= self.elevation <= 89:
             raise UserError(f"--elevation lies between -89 and 89 degrees, unlike {self.elevation:g}.")
-        if self.max_depth < 2:
-            raise UserError(f"--max-depth must be at least 2 (direct light), not {self.max_depth}.")
+        if not 2 <= self.max_depth <= memory.LONGEST_PATH:
+            raise UserError(f"--max-depth must be at least 2 (direct light) and at most "
+                            f"{memory.LONGEST_PATH}, not {self.max_depth}.")
         if self.channel not in CHANNELS:
             raise UserError(f"--channel '{self.channel}' is unknown; choose one of {', '.join(CHANNELS)}.")
 
@@ -73,9 +75,12 @@ def render_turntable(folder: Path, config: TurntableConfig | None = None, *,
         envmap: light instead of the fitted one.
 
     Raises:
-        UserError: the folder holds no fit, its mesh is empty, or the map cannot be read.
+        UserError: the folder holds no fit, its mesh is empty, the map cannot be read, or there is too little
+            memory for a picture.
     """
     config = config or TurntableConfig()
+    memory.require_for_image(config.size, config.size, config.spp, "A picture of the turntable",
+                             "lower its size or its samples per pixel")
     scene = load_fitted_scene(Path(folder), envmap)
     mesh_file = Path(folder) / "mesh.ply"
     mesh = read_ply(mesh_file)

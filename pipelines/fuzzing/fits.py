@@ -142,8 +142,93 @@ def write_started_fit(folder: Path) -> None:
     try:
         fit_scene(scene, folder / "out", config=config, report=False, quiet=True, observer=_Stop())
     except _Stopped:
+        _find_of_views(folder / "out" / "checkpoint.npz")
         return
     raise AssertionError("the fit has not come to its joint stage")
+
+
+def _find_of_views(path: Path) -> None:
+    """Puts into a checkpoint what stages may have found of its views: gains, pixels to ignore, poses."""
+    from bowl import SIZE, VIEWS
+
+    from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+    from gshell_mi.packed_pixels import packed
+
+    checkpoint = Checkpoint.load(path)
+    ignored = np.zeros((SIZE, SIZE), bool)
+    ignored[:, :3] = True
+    checkpoint.arrays |= {"gains": np.full((VIEWS, 3), 1.1, np.float32), "ignored": packed([ignored] * VIEWS),
+                          "poses": np.full((VIEWS, 6), 1e-3)}
+    checkpoint.save(path)
+
+
+def write_views_in_doubt(folder: Path) -> None:
+    """A scene of few pixels, of some of which nothing is known."""
+    from bowl import SIZE, write_fit_scene
+
+    scene = write_fit_scene(folder)
+    text = scene.read_text(encoding="utf-8").replace(f'value="{SIZE}"', 'value="12"')
+    scene.write_text(text.replace('value="20"', 'value="8"'), encoding="utf-8")
+    known = np.ones((12, 12, 1), np.float32)
+    known[:, :2] = 0.5
+    for path in sorted(scene.with_suffix("").glob("*.exr")):
+        small = np.array(mi.Bitmap(str(path))).reshape(12, SIZE // 12, 12, SIZE // 12, 4).mean(axis=(1, 3))
+        mi.Bitmap(small.astype(np.float32)).write(str(path))
+        mi.Bitmap(known, mi.Bitmap.PixelFormat.Y).write(str(path.with_suffix(".known.exr")))
+
+
+def judge_views(folder: Path) -> None:
+    """The stages that judge views, as a fit runs them, one after another."""
+    from silent_steps import Silent
+
+    from gshell_mi.fit.config import FitConfig
+    from gshell_mi.fit.lattices import Lattices
+    from gshell_mi.fit.stage import Fit
+    from gshell_mi.fit.stages.exposures import Exposures
+    from gshell_mi.fit.stages.hull import Hull
+    from gshell_mi.fit.stages.occlusion import Occlusion
+    from gshell_mi.fit.stages.poses import Poses
+    from gshell_mi.fit.surface import Surface
+    from gshell_mi.scene import load_fit_scene
+
+    config = FitConfig().changed({"radiance.batch": 1024, "occlusion.most": 0.2, "occlusion.levels": 2,
+                                  "cameras.places": 500, "gains.places": 100})
+    scene = load_fit_scene(folder / "bowl.xml")
+    given = Fit(scene, config, Lattices.of(scene.subject, config))
+    surface = Surface(scene.subject.fields())
+    for stage in (Occlusion(config.occlusion), Hull(config.hull), Exposures(config.gains),
+                  Poses(config.cameras)):
+        surface = stage.run(given.corrected(surface), surface, Silent()).after(surface)
+    given.corrected(surface)
+
+
+def damage_pixels(path: Path, random: Random) -> None:
+    """Damages a file, or writes another picture that a camera or a mask may have given."""
+    if random.random() < 0.1:
+        damage_file(path, random)
+        return
+    pixels = np.array(mi.Bitmap(str(path)))
+    pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.float32)
+    alpha, kind = pixels[..., -1:], random.randrange(8)
+    if kind == 0:
+        pixels[...] = random.choice((0.0, 1.0, 1e-30, 0.5))
+    elif kind == 1:
+        alpha[...] = random.choice((0.0, 1.0, 0.4999))
+    elif kind == 2:
+        pixels[..., :-1] *= random.choice((0.0, -1.0, 1e-20, 1e4, 1e30))
+    elif kind == 3:
+        pixels[random.randrange(len(pixels)), random.randrange(len(pixels))] = random.choice(
+            (0.0, 1.0, -1.0, 1e38, np.nan, np.inf))
+    elif kind == 4:
+        pixels[...] = np.random.default_rng(random.randrange(2**32)).random(pixels.shape)
+    elif kind == 5:
+        pixels[...] = pixels[::-1].copy()
+    elif kind == 6:
+        alpha[:, random.randrange(len(pixels)):] = random.choice((0.0, 1.0))
+    else:
+        pixels[...] = np.roll(pixels, random.randrange(1, len(pixels)), axis=random.randrange(2))
+    kinds = {1: mi.Bitmap.PixelFormat.Y, 4: mi.Bitmap.PixelFormat.RGBA}
+    mi.Bitmap(pixels, kinds[pixels.shape[2]]).write(str(path))
 
 
 def resume(folder: Path) -> None:

@@ -12,9 +12,11 @@ import trimesh
 
 from .fits import (
     compare,
+    damage_pixels,
     damage_state,
     export,
     film,
+    judge_views,
     load_checkpoint,
     report,
     resume,
@@ -23,6 +25,7 @@ from .fits import (
     write_fit_with_targets,
     write_reported_fit,
     write_started_fit,
+    write_views_in_doubt,
 )
 from .target import Target, command
 
@@ -229,5 +232,6 @@ TARGETS = {
     "checkpoint": Target(write_checkpoint, load_checkpoint, "*.npz"),
     "resume": Target(write_started_fit, resume, "out/checkpoint.npz", "out/log.jsonl", "out/gshell_mi.json",
                      keeps="out/", damage=damage_state),
+    "views": Target(write_views_in_doubt, judge_views, "view_*.exr", damage=damage_pixels),
     "light": Target(_map, _light, "map.*"),
 }

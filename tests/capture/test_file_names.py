@@ -20,6 +20,9 @@ def folder(tmp_path):
     ("a.png", "a.png", "a.png"), ("a.png", "a", "a.png"), ("a.PNG", "a", "a.PNG"),
     ("a.PNG", "a.png", "a.PNG"), ("a.jpg", "a.JPG", "a.jpg"), ("a.1.png", "a.1", "a.1.png"),
     ("A.png", "a.png", None), ("a.png", "b.png", None),
+    ("u\u0308.png", "\u00fc.png", "u\u0308.png"), ("\u00fc.JPG", "u\u0308", "\u00fc.JPG"),
+    ("fu\u0308r/e\u0301/a.png", "f\u00fcr/\u00e9/a.png", "fu\u0308r/e\u0301/a.png"),
+    ("u.png", "\u00fc.png", None), ("u/a.png", "\u00fc/a.png", None),
     ("a.png", "a.jpg", None), ("a.png", "x" * 300, None), ("a.png", "a\0.png", None), ("a.png", "", None),
 ])
 def test_suffixes_may_be_left_out_or_in_another_case(there, named, found, folder):

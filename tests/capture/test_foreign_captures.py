@@ -7,6 +7,7 @@ import shutil
 import mitsuba as mi
 import numpy as np
 import pytest
+import tifffile
 from known_capture import (
     BALL,
     RADIUS,
@@ -168,6 +169,29 @@ def test_byte_order_mark(model):
     assert len(read_capture(model).frames) == len(CAMERAS)
 
 
+def test_lines_of_images_that_end_in_another_way(model):
+    """Spaces after a name, and the line ends of Windows and of old Macs."""
+    path = model / "sparse" / "0" / "images.txt"
+    text, before = path.read_text(encoding="utf-8"), read_capture(model).frames
+    for end in ("  \n", "\r\n", "\r"):
+        path.write_bytes(text.replace("\n", end).encode())
+        assert [frame.image for frame in read_capture(model).frames] == [frame.image for frame in before]
+
+
+@pytest.mark.parametrize("edit, words", [
+    (lambda words: [words[0], "0", "0", "0", "0", *words[5:]], "The pose of image '.*' of "),
+    (lambda words: [*words[:9], "IMG 00.png"], "images.txt' has the image 'IMG 00.png' twice"),
+])
+def test_images_that_no_model_has(edit, words, model):
+    path = model / "sparse" / "0" / "images.txt"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    images = [number for number, line in enumerate(lines) if line.count(" ") >= 9 and line[0] != "#"]
+    lines[images[1]] = " ".join(edit(lines[images[1]].split(" ")))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with pytest.raises(UserError, match=words):
+        read_capture(model)
+
+
 def test_widths_of_hundreds_of_digits(model):
     path = model / "sparse" / "0" / "cameras.txt"
     path.write_text(path.read_text(encoding="utf-8").replace(" 16 12 ", f" {'9' * 400} 12 ", 1),
@@ -309,7 +333,7 @@ def test_masks_of_another_white_are_stretched(level, nerf, tmp_path):
     rescaled_alpha(nerf, lambda number: level)
     result = import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(resolution=8))
     np.testing.assert_allclose(largest_coverage(result), 1, atol=1e-3)
-    assert any(f"masks is {level} of 255" in warning for warning in result.warnings)
+    assert any(f"value in the masks is {level} of 255" in warning for warning in result.warnings)
 
 
 @pytest.mark.parametrize("inverted", [False, True])
@@ -328,6 +352,38 @@ def test_mask_files_of_another_white_are_stretched(inverted, tmp_path):
     expected[2:4, 2:6] = 1
     np.testing.assert_allclose(found, expected, atol=1e-6)
     np.testing.assert_allclose(read_ignored(frame, (6, 8), 1, white), abs(expected - inverted), atol=1e-6)
+
+
+def a_frame(mask):
+    return Frame(mask.with_name("a.png"), Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4)), mask)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_masks_that_number_parts_cover_them_all(dtype, tmp_path):
+    """The first one shows only part 2, and the last one nothing."""
+    for number, parts in enumerate(([0, 0, 2, 2], [0, 1, 2, 2], [0, 7, 1, 0], [0, 0, 0, 0])):
+        Image.fromarray(np.repeat(np.array([parts] * 6, dtype), 2, axis=1)).save(tmp_path / f"{number}.png")
+    frames = [a_frame(tmp_path / f"{number}.png") for number in range(4)]
+    white = white_of(frames)
+    for frame, parts in zip(frames, ([0, 0, 1, 1], [0, 1, 1, 1], [0, 1, 1, 0], [0] * 4), strict=True):
+        found = coverage_of(frame, np.zeros((6, 8, 3), np.uint8), white=white)
+        np.testing.assert_allclose(found, np.repeat([parts] * 6, 2, axis=1), atol=1e-6)
+
+
+@pytest.mark.parametrize("top", [1, 255, 65535])
+def test_floating_point_masks_of_the_values_of_integers(top, tmp_path):
+    """An outline's grey stays what it is."""
+    values = np.repeat(np.array([[0, 0, 0, 0.25, 1, 1, 1, 1]], np.float32), 6, axis=0)
+    tifffile.imwrite(tmp_path / "mask.tif", values * np.float32(top))
+    frame = a_frame(tmp_path / "mask.tif")
+    assert white_of([frame]) == 1
+    np.testing.assert_allclose(coverage_of(frame, np.zeros((6, 8, 3), np.uint8)), values, atol=1e-6)
+
+
+def test_eight_bits_in_sixteen_are_no_numbers_of_parts(tmp_path):
+    values = np.array([[0, 12, 255, 255]] * 6, np.uint16)
+    Image.fromarray(values).save(tmp_path / "mask.png")
+    assert white_of([a_frame(tmp_path / "mask.png")]) == pytest.approx(255 / 65535)
 
 
 def test_masks_that_disagree_or_are_feathered_are_as_they_are(tmp_path):

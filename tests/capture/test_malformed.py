@@ -225,6 +225,8 @@ CASES = {
     "size below zero": ("nerf", nothing, ["--max-size", "-1"], "--max-size"),
     "hold out all": ("nerf", nothing, ["--hold-out", "1"], "--hold-out"),
     "resolution too low": ("nerf", nothing, ["--resolution", "2"], "--resolution"),
+    "resolution too high": ("nerf", nothing, ["--resolution", "1000000"], "--resolution must be from 4"),
+    "no tolerance": ("nerf", nothing, ["--background-tolerance", "nan"], "--background-tolerance must"),
     "light missing": ("nerf", nothing, ["--light", "no.exr"], "--light"),
     "light no image": ("nerf", nothing, ["--light", "{source}/transforms_train.json"], "environment map"),
     "exposures no table": ("nerf", nothing, ["--exposures", "{source}/train/r_0.png"], "--exposures"),

@@ -99,6 +99,7 @@ def test_other_sensors(sphere, tmp_path):
     (("{fit}", "--mesh", "{none}"), "does not exist; check the path"),
     (("{fit}", "--mesh", "{text}"), "cannot be read"),
     (("{fit}", "--variant", "scalar_rgb"), "is not usable"),
+    (("{fit}", "--spp", "10000000000"), "GiB are free; lower --spp"),
     (("{targets}", "{none}"), "does not exist; check the path"),
     (("{targets}", "{targets}/view_000.exr"), "are a folder and a file"),
     (("{targets}", "{empty}"), "have no EXR files of the same name"),
@@ -108,7 +109,7 @@ def test_other_sensors(sphere, tmp_path):
     (("{targets}/view_000.exr", "{fit}/light.exr"), "only images of one size"),
     (("{targets}", "{dim}", "--json", "{none}/a/b.json"), "cannot be written"),
     (("{targets}", "{dim}", "--json", "/dev/full/a"), "'/dev/full/a' cannot be written"),
-    (("{targets}/view_000.exr", "{dim}/view_000.exr", "--json", "{dim}/view_000.exr"), "is compared, and"),
+    (("{targets}/view_000.exr", "{dim}/view_000.exr", "--json", "{dim}/view_000.exr"), "was not written by"),
 ])
 def test_mistakes(sphere, tmp_path, capsys, arguments, message):
     (tmp_path / "empty").mkdir()
@@ -119,6 +120,36 @@ def test_mistakes(sphere, tmp_path, capsys, arguments, message):
     assert main([argument.format(**places) for argument in arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and message in error and error.count("\n") == 1
+
+
+def test_what_no_comparison_wrote_is_left_alone(sphere, tmp_path, capsys):
+    """Metrics of a fit, photographs beside images; but files of an earlier comparison are replaced."""
+    images = shutil.copytree(sphere.dim, tmp_path / "images")
+    metrics, photograph = tmp_path / "metrics.json", images / "view_001.png"
+    metrics.write_text('{"targets": "x"}')
+    Image.new("RGB", (4, 4)).save(photograph)
+    before = photograph.read_bytes()
+    given = [str(sphere.targets), str(sphere.dim)]
+    for options, file in ((("--json", metrics), metrics), (("-o", images), photograph)):
+        assert main([*given, *map(str, options)]) == 2
+        assert f"'{file}' exists and was not written by gshell_mi" in capsys.readouterr().err
+    assert metrics.read_text() == '{"targets": "x"}' and photograph.read_bytes() == before
+    assert not (images / "view_000.png").exists()
+    for _ in range(2):
+        own = "--json", str(tmp_path / "own.json"), "-o", str(tmp_path / "errors")
+        assert main([*given, *own]) == 0
+
+
+def test_ids_of_a_fit_do_not_leave_the_folder(sphere, tmp_path, capsys):
+    folder = shutil.copytree(sphere.folder, tmp_path / "fit")
+    scene = (folder / "scene.xml").read_text()
+    (folder / "scene.xml").write_text(scene.replace('"view_000"', '"../../escaped"'))
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    shutil.copy(sphere.targets / "view_000.exr", tmp_path / "escaped.exr")
+    shutil.copy(sphere.targets / "view_001.exr", tmp_path / "a" / "b")
+    assert main([str(folder), "--targets", str(tmp_path / "a" / "b"), "-o", str(tmp_path / "c" / "d")]) == 2
+    assert "has a '/', so no error image can have it" in capsys.readouterr().err
+    assert not (tmp_path / "escaped.png").exists() and not (tmp_path / "c").exists()
 
 
 def test_fit_that_does_not_know_its_targets(sphere, tmp_path, capsys):

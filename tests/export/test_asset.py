@@ -236,6 +236,8 @@ def test_command(fit, capsys):
     (("--texture-size", "0"), "--texture-size must be at least 16 pixels"),
     (("--face-count", "-1"), "--face-count must not be negative"),
     (("--min-quality", "1.5"), "--min-quality lies between 0 and 1"),
+    (("--texture-size", "1000000"), "GiB are free; lower --texture-size"),
+    (("--unwrap-seconds", "nan"), "--unwrap-seconds lies between 0 and"),
 ])
 def test_mistakes(tmp_path, capsys, arguments, message):
     assert command.main([str(tmp_path / "none"), *arguments]) == 2

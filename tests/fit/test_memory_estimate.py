@@ -38,6 +38,9 @@ def test_targets_grow_with_pixels_and_the_lattice_with_cells():
     (FitConfig(render=RenderConfig(primal_spp=512)), 64, SIZES, "lower --render.primal-spp and --render.spp"),
     (FitConfig(volume=VolumeConfig(iterations=0)), 16, SIZES[:2], "close other programs"),
     (FitConfig(), 16, SIZES[:2], "lower --volume.side"),
+    (FitConfig().changed({"model.light_height": 100_000}), 64, SIZES, "lower --model.light-height"),
+    *((FitConfig().changed({name: 10**9}), 64, SIZES, "lower --radiance.batch, --cavities.batch, ")
+      for name in ("radiance.batch", "cavities.batch", "volume.batch", "cameras.places")),
 ])
 def test_the_cure_is_for_what_takes_most(config, resolution, sizes, cure):
     estimate = MemoryEstimate.of(config, resolution, sizes)
@@ -45,6 +48,12 @@ def test_the_cure_is_for_what_takes_most(config, resolution, sizes, cure):
     estimate.require(None)
     with pytest.raises(UserError, match=rf"The fit needs about .* GiB .* are free; {cure}.* GiB\.$"):
         estimate.require(estimate.total - 1)
+
+
+def test_absurd_numbers_of_views_are_those_that_there_are():
+    """They take no memory."""
+    many = FitConfig(triptychs=10**12).changed({"gains.places": 10**12})
+    assert MemoryEstimate.of(many, 64, SIZES) == MemoryEstimate.of(FitConfig(), 64, SIZES)
 
 
 def test_a_fit_that_cannot_fit_is_refused_before_it_reads_targets(bowl_scene, tmp_path, monkeypatch, capfd):

@@ -240,6 +240,12 @@ def test_every_number_has_its_bounds():
                 FitConfig().changed({name: wrong})
 
 
+@pytest.mark.parametrize("name", ["occlusion.levels", "cameras.levels", "render.views"])
+def test_numbers_that_would_never_end(name):
+    with pytest.raises(UserError, match=f"^--{name} must be at most"):
+        FitConfig().changed({name: 10**12})
+
+
 @pytest.mark.parametrize("words", [("eikonal", "-1"), ("eikonal", "nan")])
 def test_weights_of_further_losses_have_theirs(told, words):
     assert "--losses.extra eikonal must be" in told("--losses.extra", *words)

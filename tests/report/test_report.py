@@ -305,6 +305,7 @@ def test_turntable_plays(page):
     (("{none}",), "is missing or no JSON; give the folder of a finished fit"),
     (("{fit}", "--views", "0"), "--views must be at least 1"),
     (("{fit}", "--turntable-size", "33"), "must be even"),
+    (("{fit}", "--turntable-size", "10000000"), "GiB are free; lower its size or its samples"),
 ])
 def test_mistakes(folder, tmp_path, capsys, arguments, message):
     assert main([argument.format(none=tmp_path / "none", fit=folder) for argument in arguments]) == 2

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -112,8 +113,8 @@ def _image_folder(source: Path, model: Path) -> Path:
 
 
 def _camera_to_world(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    with np.errstate(all="ignore"):    # what is not finite is refused as a pose
-        w, x, y, z = quaternion / max(np.linalg.norm(quaternion), 1e-12)
+    with np.errstate(all="ignore"):    # what is not finite, as of a quaternion of 0, is refused as a pose
+        w, x, y, z = quaternion / np.linalg.norm(quaternion)
     rotation = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
                          [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
                          [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
@@ -143,7 +144,8 @@ def _check_model(model: str, path: Path) -> None:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
+        # Names may hold what else ends lines in Python.
+        return path.read_text(encoding="utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"'{path}' is no text file ({error}); export the model again.") from error
 
@@ -186,11 +188,17 @@ def _read_images_txt(path: Path) -> dict[str, tuple[int, np.ndarray, np.ndarray]
         words = line.split(maxsplit=9)    # a name may hold spaces
         try:
             values = np.array(words[1:8], dtype=np.float64)
-            camera, name = int(words[8]), words[9]
+            camera, name = int(words[8]), words[9].rstrip()
         except (ValueError, IndexError):
             raise _malformed(path, number) from None
+        _check_new(name, poses, path)
         poses[name] = (camera, values[:4], values[4:7])
     return poses
+
+
+def _check_new(name: str, poses: dict[str, Any], path: Path) -> None:
+    if name in poses:
+        raise UserError(f"'{path}' has the image '{name}' twice; export the model again.")
 
 
 def _are_keypoints(line: str) -> bool:
@@ -259,5 +267,6 @@ def _read_images_bin(path: Path) -> dict[str, tuple[int, np.ndarray, np.ndarray]
         _, *values, camera = reader.take("i7di")
         name = reader.name()
         reader.skip(24 * reader.take("Q")[0])    # keypoints: x, y, id of the 3-D point
+        _check_new(name, poses, path)
         poses[name] = (camera, np.array(values[:4]), np.array(values[4:]))
     return poses

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+from ...memory import LONGEST_PATH
 from ..bounds import Between
 
 
@@ -12,16 +13,16 @@ from ..bounds import Between
 class RenderConfig:
     """How images are made that targets are compared with."""
 
-    views: Annotated[int, Between(1)] = 3
+    views: Annotated[int, Between(1, 1000)] = 3
     """Views that a step renders; it follows the mean of their losses. What a step takes beside rendering is
     shared by them."""
     spp: Annotated[int, Between(1)] = 2
     """Samples per pixel of the gradient render."""
     primal_spp: Annotated[int, Between(1)] = 6
     """Samples per pixel of the image that the loss compares; independent of the gradient's samples."""
-    max_depth: Annotated[int, Between(2)] = 5
+    max_depth: Annotated[int, Between(2, LONGEST_PATH)] = 5
     """Longest path: 2 is direct light, 3 adds one interreflection. That of the exported scene is 5."""
-    gradient_depth: Annotated[int, Between(2)] = 3
+    gradient_depth: Annotated[int, Between(2, LONGEST_PATH)] = 3
     """Longest path that is differentiated; what longer ones add to an image counts as constant."""
     reparam_depth: Annotated[int, Between(1, 3)] = 1
     """Path segments whose visibility is differentiated: 1 is what the camera sees, 2 adds shadows, and is

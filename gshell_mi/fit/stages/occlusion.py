@@ -41,7 +41,7 @@ class OcclusionConfig:
     most: Annotated[float, Between(0, 0.5)] = 0.1
     """Share of the views whose masks may be wrong at a place; 0 believes all of them. A stand that hides a
     rim from the front does so in a tenth."""
-    levels: Annotated[int, Between(1)] = 3
+    levels: Annotated[int, Between(1, 16)] = 3
     """Proposals, each of which disbelieves twice as many masks as the one before."""
 
 

@@ -30,7 +30,7 @@ class CamerasConfig:
     """Places of the surface whose texture is compared."""
     blur: Annotated[float, Between(0.5)] = 2.0
     """Blur of the images that texture is compared in, pixels: about how far poses may be off."""
-    levels: Annotated[int, Between(1)] = 2
+    levels: Annotated[int, Between(1, 16)] = 2
     """How often the blur is halved, less one: as poses get better, finer texture tells more."""
     rounds: Annotated[int, Between(1)] = 3
     """Steps for each of them."""
