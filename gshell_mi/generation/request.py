@@ -39,3 +39,17 @@ def _sample(folder: Path, request: Request) -> tuple[np.ndarray, float]:
     from .sampling import sample_fields
 
     return sample_fields(folder, request)
+
+
+def autoencoded(folder: Path, fields: np.ndarray) -> tuple[np.ndarray, int]:
+    """Fields (n, 2, N, N, N) after a way through a model's autoencoder, and how many numbers each is there.
+    Imports ``torch``."""
+    import torch
+
+    from .training import load_model
+
+    model = load_model(folder, torch.device("cpu"))
+    with torch.no_grad():
+        latents = [model.autoencoder.encode(torch.from_numpy(pair[None]).float()) for pair in fields]
+        again = [model.autoencoder.decode(one)[0].numpy() for one in latents]
+    return np.stack(again), latents[0].numel()
