@@ -18,7 +18,7 @@ from gshell_mi.generation.converted import converted, round_trip
 from gshell_mi.generation.encodings import ENCODINGS
 from gshell_mi.generation.fields import TruncatedFields, normalised
 from gshell_mi.generation.own_process import in_own_process
-from gshell_mi.generation.request import autoencoded
+from gshell_mi.generation.request import coded
 from gshell_mi.generation.sources import garment_sources
 from gshell_mi.topology import topology
 
@@ -32,7 +32,7 @@ class _Arguments:
     seed: int = 1
     """Of the garments."""
     model: Path | None = None
-    """Folder of a trained model, whose autoencoder is compared, too."""
+    """Folder of a trained model, whose own code is compared, too."""
 
 
 def main() -> None:
@@ -57,8 +57,8 @@ def main() -> None:
         _row(name, numbers, meshes, lambda i, e=encoding, c=codes: e.decode(c[i], given.side))
     if given.model is not None:
         fields = np.stack([np.stack([row.fields.sdf, row.fields.msdf]) for row in kept])
-        again, numbers = in_own_process(autoencoded, given.model, fields)
-        _row("latents", numbers, meshes, lambda i: TruncatedFields(*again[i]))
+        again, numbers = in_own_process(coded, given.model, fields)
+        _row("in the model", numbers, meshes, lambda i: TruncatedFields(*again[i]))
 
 
 def _row(name: str, numbers: float, meshes: list, decoded) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import UserError
 from .own_process import in_own_process
 
 
@@ -41,15 +42,19 @@ def _sample(folder: Path, request: Request) -> tuple[np.ndarray, float]:
     return sample_fields(folder, request)
 
 
-def autoencoded(folder: Path, fields: np.ndarray) -> tuple[np.ndarray, int]:
-    """Fields (n, 2, N, N, N) after a way through a model's autoencoder, and how many numbers each is there.
-    Imports ``torch``."""
+def coded(folder: Path, fields: np.ndarray) -> tuple[np.ndarray, int]:
+    """Fields (n, 2, N, N, N) after a way through a model's own code, and its numbers of each. Imports torch.
+
+    Raises:
+        UserError: the model has none.
+    """
     import torch
 
     from .training import load_model
 
     model = load_model(folder, torch.device("cpu"))
+    if model.config.model == "unet":
+        raise UserError(f"The model in '{folder}' sees the fields themselves; give one of another kind.")
     with torch.no_grad():
-        latents = [model.autoencoder.encode(torch.from_numpy(pair[None]).float()) for pair in fields]
-        again = [model.autoencoder.decode(one)[0].numpy() for one in latents]
-    return np.stack(again), latents[0].numel()
+        found = [model.coded(torch.from_numpy(pair[None]).float()) for pair in fields]
+    return np.concatenate([again.numpy() for again, _ in found]), found[0][1]

@@ -56,7 +56,7 @@ def test_a_seed_is_one_model_and_a_run_in_two_parts_the_same(tiny_set, tmp_path)
               "from gshell_mi.generation import training\n"
               "step = training._Training._take_step\n"
               "def cut(self, *given):\n"
-              "    if self.step == 3: raise KeyboardInterrupt\n"
+              "    if self._all.step == 3: raise KeyboardInterrupt\n"
               "    return step(self, *given)\n"
               "training._Training._take_step = cut\n"
               "from trained import train_tiny\n"

@@ -113,6 +113,11 @@ class LatentFlow(nn.Module):
         found = self.flow((1 - at) * noise + at * x, batch["t"], batch["kinds"])
         return (found.float() - (x - noise)).square().mean()
 
+    def coded(self, fields: Tensor) -> tuple[Tensor, int]:
+        """Fields after a way through the latents, and the numbers of each."""
+        latents = self.autoencoder.encode(fields)
+        return self.autoencoder.decode(latents), latents[0].numel()
+
     # -- sampling -------------------------------------------------------------------------------------
 
     @torch.no_grad()

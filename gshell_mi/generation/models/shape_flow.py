@@ -152,6 +152,11 @@ class ShapeFlow(nn.Module):
         found = self.flow((1 - at) * noise + at * x, batch["t"], batch["kinds"])
         return (self.weight * (found.float() - (x - noise)).square()).mean()
 
+    def coded(self, fields: Tensor) -> tuple[Tensor, int]:
+        """Fields after a way through the components, and the numbers of each."""
+        points = (self._to_nodes(fields) - self.mean) @ self._inverse()
+        return self._fields(points).clamp(-1, 1), self.components
+
     # -- sampling -------------------------------------------------------------------------------------
 
     @torch.no_grad()
