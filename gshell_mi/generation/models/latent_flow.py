@@ -131,7 +131,8 @@ class LatentFlow(nn.Module):
         """
         device = self.autoencoder.mean.device
         noise = steering.noise((self.channels, *3 * (self.per_side,)), 0).to(device)
-        start = goal = held = lost = kept = None
+        start = goal = held = kept = None
+        lost: Tensor | float = 0.0
         if steering.start is not None:
             start = torch.from_numpy(np.ascontiguousarray(steering.start, np.float32)).to(device)[None]
             goal = self.autoencoder.encode(start)

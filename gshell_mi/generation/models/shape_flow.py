@@ -170,7 +170,8 @@ class ShapeFlow(nn.Module):
         """
         device = self.mean.device
         noise = steering.noise((self.components,), 0).to(device)
-        start = goal = lost = kept = toward = None
+        start = goal = kept = toward = None
+        lost: Tensor | float = 0.0
         if steering.start is not None:
             start = torch.from_numpy(np.ascontiguousarray(steering.start, np.float32)).to(device)[None]
             goal = (self._to_nodes(start) - self.mean) @ self._inverse()
