@@ -1,4 +1,5 @@
 # make fit      set everything up and reconstruct SCENE (default scenes/tshirt.xml) into OUT
+# make generate set everything up and sample garments from the model in the package into GARMENTS
 # make test     set everything up, check the style and the types, and run the tests
 # make regress  fit every scene with default settings and compare with the stored results
 # make scenes   rebuild the scenes from code
@@ -11,6 +12,7 @@ SHELL := /bin/bash
 MAKEFLAGS += --no-print-directory
 
 SCENE ?= scenes/tshirt.xml
+GARMENTS ?= out/garments
 OUT ?= out/$(basename $(notdir $(SCENE)))
 VENV ?= .venv
 PY := $(VENV)/bin/python
@@ -20,13 +22,16 @@ export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help fit test regress scenes docs fuzz clean
+.PHONY: help fit generate test regress scenes docs fuzz clean
 
 help:
-	@sed -n 's/^# //p' Makefile | head -6
+	@sed -n 's/^# //p' Makefile | head -7
 
 fit: $(VENV)/.llvm
 	@$(PY) -m gshell_mi.fit $(SCENE) -o $(OUT) --overwrite $(ARGS)
+
+generate: $(VENV)/.generate $(VENV)/.llvm
+	@$(PY) -m gshell_mi.generate -o $(GARMENTS) $(ARGS)
 
 test: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) -m ruff check --quiet .
@@ -57,6 +62,15 @@ $(VENV)/.package: $(PY) pyproject.toml
 $(VENV)/.test: $(VENV)/.package
 	@echo "Installing the tests' tools into $(VENV) ..."
 	@$(PY) -m pip install --quiet --editable '.[test]'
+	@touch $@
+
+# PyTorch's own index has builds without CUDA, which are a tenth of the size.
+$(VENV)/.generate: $(VENV)/.package
+	@echo "Installing PyTorch into $(VENV) ..."
+	@$(PY) -c 'import torch' 2>/dev/null || \
+	    $(PY) -m pip install --quiet torch --index-url https://download.pytorch.org/whl/cpu || \
+	    $(PY) -m pip install --quiet torch
+	@$(PY) -m pip install --quiet --editable '.[generate]'
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.package

@@ -1,12 +1,13 @@
 """What each encoding of generated garments loses: the table of docs/generation.md.
 
-    python pipelines/compare_encodings.py [--garments 100] [--side 64] [--seed 1]
+    python pipelines/compare_encodings.py [--garments 100] [--side 64] [--seed 1] [--model FOLDER]
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import tyro
@@ -14,8 +15,10 @@ import tyro
 from gshell_mi.doctor import ensure_variant
 from gshell_mi.errors import UserError
 from gshell_mi.generation.converted import converted, round_trip
-from gshell_mi.generation.encodings import ENCODINGS, BlockEncoding, Principal, from_blocks
+from gshell_mi.generation.encodings import ENCODINGS
 from gshell_mi.generation.fields import TruncatedFields, normalised
+from gshell_mi.generation.own_process import in_own_process
+from gshell_mi.generation.request import coded
 from gshell_mi.generation.sources import garment_sources
 from gshell_mi.topology import topology
 
@@ -28,8 +31,8 @@ class _Arguments:
     """Vertices per side of the grid."""
     seed: int = 1
     """Of the garments."""
-    components: tuple[int, ...] = (32, 64, 128)
-    """Principal components of blocks to try."""
+    model: Path | None = None
+    """Folder of a trained model, whose own code is compared, too."""
 
 
 def main() -> None:
@@ -52,17 +55,10 @@ def main() -> None:
         codes = [encoding.encode(row.fields) for row in kept]
         numbers = np.mean([sum(array.size for array in code.values()) for code in codes])
         _row(name, numbers, meshes, lambda i, e=encoding, c=codes: e.decode(c[i], given.side))
-    codes = [BlockEncoding().encode(row.fields) for row in kept]
-    values = np.concatenate([code["values"] for code in codes])
-    for components in given.components:
-        basis = Principal.of(values, components)
-        numbers = np.mean([components * len(code["blocks"]) for code in codes])
-
-        def decoded(i: int, basis: Principal = basis) -> TruncatedFields:
-            tokens = basis.encode(codes[i]["values"])
-            return from_blocks(codes[i]["blocks"], np.clip(basis.decode(tokens), -1, 1), given.side)
-
-        _row(f"blocks, {components} components", numbers, meshes, decoded)
+    if given.model is not None:
+        fields = np.stack([np.stack([row.fields.sdf, row.fields.msdf]) for row in kept])
+        again, numbers = in_own_process(coded, given.model, fields)
+        _row("in the model", numbers, meshes, lambda i: TruncatedFields(*again[i]))
 
 
 def _row(name: str, numbers: float, meshes: list, decoded) -> None:

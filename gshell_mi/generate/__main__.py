@@ -12,22 +12,23 @@ import tyro
 from ..command_line import run_command
 from ..errors import UserError
 from ..generation.checks import check_choice, check_positive
+from ..generation.model_config import SHIPPED
 from ..generation.own_process import require_torch
 
 
 @dataclass(frozen=True)
 class _Arguments:
-    model: tyro.conf.Positional[Path]
-    """Folder that python -m gshell_mi.train wrote."""
+    model: tyro.conf.Positional[Path | None] = None
+    """Folder that python -m gshell_mi.train wrote. Default: the package's own model of garments."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder for the meshes; earlier ones are replaced. Default: generated, in the model's."""
+    """Folder for the meshes; earlier ones are replaced. Default: generated, in MODEL or here."""
     count: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 16
     """How many."""
     kind: Annotated[str | None, tyro.conf.arg(name="class")] = None
     """Class of all of them; default: the model's classes in turn."""
     seed: int = 0
     """Of the first sample; the others count on."""
-    guidance: float = 1.5
+    guidance: float = 1.0
     """Weight of the class; 1 is the plain model, more is more typical."""
     steps: int = 32
     """Steps from noise to a surface."""
@@ -74,8 +75,9 @@ def _generate(given: _Arguments) -> None:
     require_torch()
     from ..generation.sampled import generate
 
+    output = given.output or (given.model or Path()) / "generated"
     print(generate(
-        given.model, given.output or given.model / "generated", count=given.count, kind=given.kind,
+        given.model or SHIPPED, output, count=given.count, kind=given.kind,
         seed=given.seed, guidance=given.guidance, steps=given.steps, interpolate=given.interpolate,
         near=given.near, strength=given.strength, complete=given.complete, suffix=given.format,
         batch=given.batch, device=given.device, quiet=given.quiet))

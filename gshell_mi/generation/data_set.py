@@ -107,7 +107,8 @@ class DataSet:
     @cached_property
     def records(self) -> list[Record]:
         """Of all objects, in order."""
-        return [record for shard in self.shards() for record in shard.records]
+        return [record for number in range(self.config["shards"])
+                for record in read_records(self.shard_path(number))]
 
     def load(self, *, held_out: bool) -> tuple[list[Record], np.ndarray, np.ndarray, np.ndarray]:
         """Records, signed distances and mSDFs (n, N, N, N) float16 and points (n, 2048, 3) of one split.
@@ -157,16 +158,33 @@ def write_shard(path: Path, rows: list[Row], rejected: list[dict], side: int, he
             records=np.array(json.dumps(records)), rejected=np.array(json.dumps(rejected)))
 
 
+def read_records(path: Path) -> list[Record]:
+    """What is known of a shard's objects, without their fields. Raises ``UserError`` if it is damaged."""
+    try:
+        with np.load(path) as archive:
+            return _records(archive)
+    except Exception as error:  # NumPy's readers raise whatever they stumble over
+        raise _damaged(path, error) from error
+
+
+def _records(archive) -> list[Record]:
+    return [Record(**record) for record in json.loads(str(archive["records"]))]
+
+
+def _damaged(path: Path, error: Exception) -> UserError:
+    return UserError(f"Shard '{path}' cannot be read ({type(error).__name__}); remove it and run the same "
+                     f"gshell_mi.dataset command again, which makes it anew.")
+
+
 def read_shard(path: Path, side: int) -> Shard:
     """Raises ``UserError`` if the shard is damaged or of another size."""
     try:
         with np.load(path) as archive:
-            records = [Record(**record) for record in json.loads(str(archive["records"]))]
+            records = _records(archive)
             shard = Shard(records, json.loads(str(archive["rejected"])), archive["sdf"], archive["msdf"],
                           archive["points"])
     except Exception as error:  # NumPy's readers raise whatever they stumble over
-        raise UserError(f"Shard '{path}' cannot be read ({type(error).__name__}); remove it and run the same "
-                        f"gshell_mi.dataset command again, which makes it anew.") from error
+        raise _damaged(path, error) from error
     shape = (len(records), side, side, side)
     found = (shard.sdf.shape, shard.msdf.shape, shard.points.shape)
     if found != (shape, shape, (len(records), POINTS, 3)):

@@ -1,11 +1,10 @@
-"""What a model is given of a pair of fields, and the way back.
+"""Ways to write a pair of fields as numbers, and back.
 
 Compared in ``docs/generation.md``; ``pipelines/compare_encodings.py`` makes the table.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -187,33 +186,3 @@ def _solved(row, a, b, weight_a, weight_b, right, importance, count: int) -> np.
     normal = (matrix.T @ diags_array(importance) @ matrix + _DAMPING * diags_array(np.ones(count))).tocsr()
     jacobi = diags_array(1 / normal.diagonal())
     return cg(normal, matrix.T @ (importance * right), rtol=1e-6, maxiter=2000, M=jacobi)[0]
-
-
-@dataclass(frozen=True)
-class Principal:
-    """Blocks by their leading principal components, divided by one scale: the transformer's tokens."""
-
-    mean: np.ndarray
-    """(1024,)."""
-    basis: np.ndarray
-    """(1024, K), orthonormal columns."""
-    scale: float
-    """Root mean square of the components over the set."""
-
-    @classmethod
-    def of(cls, values: np.ndarray, components: int) -> Principal:
-        """Of (B, 1024) blocks."""
-        mean = values.mean(axis=0)
-        centred = (values - mean).astype(np.float64)
-        _, vectors = np.linalg.eigh(centred.T @ centred)
-        basis = vectors[:, ::-1][:, :components]
-        return cls(mean.astype(np.float32), basis.astype(np.float32), float(np.sqrt(
-            ((centred @ basis) ** 2).mean())) or 1.0)
-
-    def encode(self, values: np.ndarray) -> np.ndarray:
-        """(B, 1024) to (B, K)."""
-        return (values - self.mean) @ self.basis / self.scale
-
-    def decode(self, tokens: np.ndarray) -> np.ndarray:
-        """(B, K) to (B, 1024)."""
-        return tokens * self.scale @ self.basis.T + self.mean

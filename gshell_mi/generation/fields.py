@@ -23,6 +23,13 @@ _EXACT_MSDF_CELLS = 2.0
 _LONGEST_EDGE = 1.8
 #: Of the mSDF away from the template's edges, by means over 3^3 vertices.
 _SMOOTHINGS = 16
+#: Pieces and holes of fewer vertices are specks.
+_SPECK = 12
+#: What a speck becomes, by the truncation.
+_FLIPPED = 0.05
+#: Neighbours along the edges of the tetrahedral lattice.
+_LATTICE_NEIGHBOURS = np.array([[[(z >= 0 and y >= 0 and x >= 0) or (z <= 0 and y <= 0 and x <= 0)
+                                  for x in (-1, 0, 1)] for y in (-1, 0, 1)] for z in (-1, 0, 1)])
 #: Cells between a mesh and the cube's faces, so that its template closes within.
 MARGIN_CELLS = 3.5
 
@@ -86,9 +93,11 @@ class TruncatedFields:
         """The open mesh {sdf = 0, msdf >= 0}. Needs a Mitsuba variant.
 
         Args:
-            largest: of its pieces only those with at least a fiftieth of the faces of the largest; models
-                leave crumbs.
+            largest: without specks, and of its pieces only those with at least a fiftieth of the faces of the
+                largest; models leave crumbs.
         """
+        if largest:
+            return _without_crumbs(self.without_specks().surface())
         import mitsuba as mi
 
         lattice = TetLattice(self.side - 1)
@@ -98,8 +107,17 @@ class TruncatedFields:
         msdf = np.ascontiguousarray(self.msdf, np.float32)
         found = extract(lattice, mi.Float(sdf.ravel()), mi.Float(msdf.ravel()))
         vertices, faces, _ = found.to_numpy()
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        return _without_crumbs(mesh) if largest and len(faces) else mesh
+        return trimesh.Trimesh(vertices, faces, process=False)
+
+    def without_specks(self) -> TruncatedFields:
+        """The same without pieces and bubbles of the template, and patches and holes of the surface, of fewer
+        than 12 vertices: less than about two cells across, they are below what the grid resolves."""
+        inside = _despeckled(self.sdf < 0, np.ones(self.sdf.shape, bool))
+        sdf = np.where(inside == (self.sdf < 0), self.sdf, np.where(inside, -_FLIPPED, _FLIPPED))
+        used, _ = _template_ends(sdf, self.msdf)
+        kept = _despeckled(self.msdf >= 0, used)
+        msdf = np.where(kept == (self.msdf >= 0), self.msdf, np.where(kept, _FLIPPED, -_FLIPPED))
+        return TruncatedFields(sdf.astype(np.float32), msdf.astype(np.float32))
 
 
 def normalised(mesh: trimesh.Trimesh, side: int) -> tuple[trimesh.Trimesh, np.ndarray]:
@@ -139,8 +157,22 @@ def _template_ends(sdf: np.ndarray, msdf: np.ndarray) -> tuple[np.ndarray, np.nd
     return used.reshape(sdf.shape), rim.reshape(sdf.shape)
 
 
+def _despeckled(mask: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """The mask, with small components of it and of its complement, both within ``where``, flipped."""
+    found = mask.copy()
+    for value in (True, False):
+        labels, count = ndimage.label((found == value) & where, _LATTICE_NEIGHBOURS)
+        small = np.bincount(labels.ravel(), minlength=count + 1) < _SPECK
+        small[0] = False
+        found = np.where(small[labels], not value, found)
+    return found
+
+
 def _without_crumbs(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     from ..topology import mesh_components
+
+    if len(mesh.faces) == 0:
+        return mesh
 
     piece = mesh_components(np.asarray(mesh.faces), len(mesh.vertices))[mesh.faces[:, 0]]
     size = np.bincount(piece)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import UserError
 from .own_process import in_own_process
 
 
@@ -39,3 +40,21 @@ def _sample(folder: Path, request: Request) -> tuple[np.ndarray, float]:
     from .sampling import sample_fields
 
     return sample_fields(folder, request)
+
+
+def coded(folder: Path, fields: np.ndarray) -> tuple[np.ndarray, int]:
+    """Fields (n, 2, N, N, N) after a way through a model's own code, and its numbers of each. Imports torch.
+
+    Raises:
+        UserError: the model has none.
+    """
+    import torch
+
+    from .training import load_model
+
+    model = load_model(folder, torch.device("cpu"))
+    if model.config.model == "unet":
+        raise UserError(f"The model in '{folder}' sees the fields themselves; give one of another kind.")
+    with torch.no_grad():
+        found = [model.coded(torch.from_numpy(pair[None]).float()) for pair in fields]
+    return np.concatenate([again.numpy() for again, _ in found]), found[0][1]

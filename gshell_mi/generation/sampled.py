@@ -27,7 +27,7 @@ _HELD_CELLS = 2.0
 
 
 def generate(model: Path, output: Path, *, count: int = 16, kind: str | None = None, seed: int = 0,
-             guidance: float = 1.5, steps: int = 32, interpolate: tuple[int, int] | None = None,
+             guidance: float = 1.0, steps: int = 32, interpolate: tuple[int, int] | None = None,
              near: Path | None = None, strength: float = 0.5, complete: Path | None = None,
              suffix: str = "ply", batch: int = 16, device: str = "auto", quiet: bool = True) -> str:
     """Samples meshes into a folder; returns what to tell about them. Needs a Mitsuba variant.

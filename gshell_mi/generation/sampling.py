@@ -35,7 +35,7 @@ def sample_fields(folder: Path, request: Request) -> tuple[np.ndarray, float]:
                TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=request.quiet) as progress:
         batches = range(0, len(kinds), request.batch)
-        bar = progress.add_task("", total=2 * request.steps * len(batches))
+        bar = progress.add_task("", total=request.steps * len(batches))
         for first in batches:
             part = slice(first, first + request.batch)
             steering = Steering(kinds[part], request.seeds[part], request.guidance, request.steps,

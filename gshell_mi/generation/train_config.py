@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """How a model is trained."""
 
-    model: str = "blocks"
-    """blocks: flow matching on the blocks near the surface; unet: the dense reference."""
+    model: str = "shape"
+    """shape: flow matching on whole shapes' components; latent: on an autoencoder's latents; unet: the dense
+    reference."""
     size: str = "S"
     """XS, S (CPU), M or L (GPU)."""
     minutes: float = 90.0
@@ -21,8 +23,10 @@ class TrainConfig:
     """Objects per step, and per process under torchrun."""
     rate: float = 5e-4
     """Learning rate after the warm-up."""
-    components: int = 128
-    """Of blocks: principal components that each keeps."""
+    autoencoder: Path | None = None
+    """Folder of a trained model of this size whose autoencoder is taken; only the flow is trained then."""
+    mirror: bool = True
+    """Objects also count with left and right exchanged."""
     seed: int = 0
     """Of weights, order and noise."""
     device: str = "auto"

@@ -11,6 +11,7 @@ import tyro
 
 from ..command_line import run_command
 from ..errors import UserError
+from ..generation.model_config import MODELS, SIZES
 from ..generation.own_process import require_torch
 from ..generation.train_config import TrainConfig
 
@@ -41,13 +42,12 @@ def _train(given: _Arguments) -> None:
     from ..generation.checks import check_choice, check_positive
 
     config = given.config
-    check_choice("--model", config.model, ("blocks", "unet"))
-    check_choice("--size", config.size, ("XS", "S", "M", "L"))
+    check_choice("--model", config.model, MODELS)
+    check_choice("--size", config.size, tuple(SIZES))
     check_choice("--device", config.device, ("auto", "cpu", "cuda"))
     check_positive("--minutes", config.minutes)
     check_positive("--batch", config.batch)
     check_positive("--rate", config.rate)
-    check_positive("--components", config.components)
     if config.steps is not None:
         check_positive("--steps", config.steps)
     require_torch()

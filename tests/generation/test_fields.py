@@ -6,7 +6,7 @@ import trimesh
 
 from gshell_mi.errors import UserError
 from gshell_mi.generation.converted import converted, round_trip
-from gshell_mi.generation.encodings import BLOCK_VALUES, ENCODINGS, BlockEncoding, Principal
+from gshell_mi.generation.encodings import BLOCK_VALUES, ENCODINGS, BlockEncoding
 from gshell_mi.generation.fields import TRUNCATION_CELLS, TruncatedFields, lattice_edges, normalised
 from gshell_mi.generation.sources import Source
 from gshell_mi.topology import topology
@@ -99,13 +99,15 @@ def test_blocks_need_a_side_of_eights():
         BlockEncoding().encode(fields)
 
 
-def test_principal_components_are_exact_where_there_are_enough():
-    rng = np.random.default_rng(0)
-    values = rng.normal(size=(50, 3)) @ rng.normal(size=(3, BLOCK_VALUES)) + 1
-    found = Principal.of(values.astype(np.float32), 3)
-    tokens = found.encode(values)
-    assert tokens.shape == (50, 3) and np.allclose((tokens**2).mean(), 1, rtol=1e-3)
-    assert np.allclose(found.decode(tokens), values, atol=1e-3)
+def test_specks_are_taken_away_and_nothing_else(fields):
+    assert counts(fields.without_specks().surface()) == counts(fields.surface()) == (1, 1, 0)
+    sdf, msdf = fields.sdf.copy(), fields.msdf.copy()
+    on_sheet = np.argwhere((np.abs(sdf) < 0.1) & (msdf > 0.5))[0]
+    msdf[tuple(on_sheet)] = -1  # a pin-hole
+    sdf[2, 2, 2] = -0.5  # a crumb
+    spoilt = TruncatedFields(sdf, msdf)
+    assert counts(spoilt.surface()) != (1, 1, 0)
+    assert counts(spoilt.without_specks().surface()) == (1, 1, 0)
 
 
 def test_round_trip_measures_an_offset(mesh):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,33 +16,24 @@ from torch import Tensor, nn
 
 from ..model_config import ModelConfig
 from .steering import Steering
+from .training_set import TrainingSet
 
 _TIMES = 1000
 _DROPPED = 0.1
 
 
-@dataclass
-class Prepared:
-    """A training set as it is stored."""
-
-    values: Tensor
-    """(n, 2, N, N, N) float16."""
-    kinds: Tensor
-    """(n,)."""
-
-    def __len__(self) -> int:
-        return len(self.kinds)
-
-
 class DenseDiffusion(nn.Module):
     """A U-Net on both truncated distances."""
+
+    #: What is trained, and its share of the time.
+    stages = (("unet", 1.0),)
 
     signal: Tensor
 
     def __init__(self, config: ModelConfig):
         super().__init__()
         self.config = config
-        base = config.shape["channels"]
+        base = config.shape.channels
         # Attention where 16 or fewer vertices per side are left.
         levels = max(2, int(math.log2(config.side // 8)))
         channels = tuple(base * min(2**level, 4) for level in range(levels))
@@ -56,27 +46,43 @@ class DenseDiffusion(nn.Module):
         signal = torch.cos((at + 0.008) / 1.008 * torch.pi / 2).square()
         self.register_buffer("signal", (signal / signal[0])[1:].clamp(min=1e-5).float(), persistent=False)
 
-    def prepare(self, sdf: np.ndarray, msdf: np.ndarray, kinds: list[int]) -> Prepared:
-        """A training set (n, N, N, N)."""
-        return Prepared(torch.from_numpy(np.stack([sdf, msdf], axis=1)), torch.tensor(kinds))
+    def part(self, stage: str) -> nn.Module:
+        """What a stage trains."""
+        return self.network
 
-    def batch(self, data: Prepared, chosen: Tensor) -> dict[str, Tensor]:
-        return {"values": data.values[chosen].float(), "kinds": data.kinds[chosen]}
+    def rate(self, stage: str, rate: float) -> float:
+        """A stage's learning rate."""
+        return rate
 
-    def forward(self, batch: dict[str, Tensor], generator: torch.Generator) -> Tensor:
+    def batch_size(self, stage: str, batch: int) -> int:
+        """Objects per step of a stage."""
+        return batch
+
+    def prepare(self, stage: str, data: TrainingSet) -> TrainingSet:
+        """What a stage draws its batches from."""
+        return data
+
+    def draw(self, stage: str, data: TrainingSet, chosen: Tensor,
+             generator: torch.Generator) -> dict[str, Tensor]:
+        """A batch of the rows ``chosen``, with all its chance, on the generator's device."""
+        device, count = generator.device, len(chosen)
+        x = data.fields(chosen, device)
+        dropped = torch.rand(count, generator=generator, device=device) < _DROPPED
+        return {"x": x, "noise": torch.randn(x.shape, generator=generator, device=device),
+                "step": torch.randint(_TIMES, (count,), generator=generator, device=device),
+                "kinds": torch.where(dropped, len(self.config.classes), data.kinds[chosen].to(device))}
+
+    def forward(self, batch: dict[str, Tensor]) -> Tensor:
         """The mean squared error of the noise."""
-        x = batch["values"]
-        step = torch.randint(_TIMES, (len(x),), generator=generator).to(x.device)
-        noise = torch.randn(x.shape, generator=generator).to(x.device)
-        dropped = (torch.rand(len(x), generator=generator) < _DROPPED).to(x.device)
-        kinds = torch.where(dropped, len(self.config.classes), batch["kinds"])
+        noise, step = batch["noise"], batch["step"]
         signal = self.signal[step].view(-1, 1, 1, 1, 1)
-        found = self.network(signal.sqrt() * x + (1 - signal).sqrt() * noise, step, class_labels=kinds)
+        found = self.network(signal.sqrt() * batch["x"] + (1 - signal).sqrt() * noise, step,
+                             class_labels=batch["kinds"])
         return (found.float() - noise).square().mean()
 
     @torch.no_grad()
     def sample(self, steering: Steering, told: Callable[[], None] = lambda: None) -> np.ndarray:
-        """(B, 2, N, N, N) float32 truncated fields; ``told`` is called after each of ``2 steering.steps``."""
+        """(B, 2, N, N, N) float32 truncated fields; ``told`` is called ``steering.steps`` times."""
         device, side = self.signal.device, self.config.side
         noise = steering.noise((2, side, side, side), 0).to(device)
         kinds = torch.tensor(steering.kinds, device=device)
@@ -93,6 +99,7 @@ class DenseDiffusion(nn.Module):
             return self.signal[step].sqrt() * goal + (1 - self.signal[step]).sqrt() * noise
 
         x = noise if strength == 1 else noisy(steps[0]).expand_as(noise)
+        number = 0
         for now, then in zip(steps, [*steps[1:], -1], strict=True):
             if known is not None:
                 x = torch.where(known, noisy(now), x)
@@ -106,7 +113,8 @@ class DenseDiffusion(nn.Module):
             found = (x - signal.sqrt() * clean) / (1 - signal).sqrt()
             after = self.signal[then] if then >= 0 else torch.ones_like(signal)
             x = after.sqrt() * clean + (1 - after).sqrt() * found
-            told()
+            if (number := number + 1) % 2 == 0:
+                told()
         if known is not None and goal is not None:
             x = torch.where(known, goal, x)
         return x.cpu().numpy()

@@ -1,4 +1,4 @@
-"""A transformer over tokens that stand somewhere in a cube."""
+"""A transformer over tokens that fill a cube."""
 
 from __future__ import annotations
 
@@ -23,69 +23,68 @@ class Block(nn.Module):
     third of the weights.
     """
 
-    def __init__(self, width: int, heads: int):
+    def __init__(self, width: int, heads: int, dropout: float):
         super().__init__()
         self.heads = heads
         self.into = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
         self.perceptron = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(approximate="tanh"),
-                                        nn.Linear(4 * width, width))
+                                        nn.Dropout(dropout), nn.Linear(4 * width, width))
+        self.dropout = nn.Dropout(dropout)
         self.modulation = nn.Parameter(torch.zeros(6, width))
 
-    def forward(self, x: Tensor, condition: Tensor, mask: Tensor) -> Tensor:
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         batch, tokens, width = x.shape
         modulation = (condition + self.modulation)[:, :, None].unbind(dim=1)
         shift_a, scale_a, gate_a, shift_p, scale_p, gate_p = modulation
         normal = F.layer_norm(x, (width,)) * (1 + scale_a) + shift_a
         q, k, v = self.into(normal).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
-        seen = F.scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None, None])
-        x = x + gate_a * self.out(seen.transpose(1, 2).reshape(batch, tokens, width))
+        seen = F.scaled_dot_product_attention(q, k, v)
+        x = x + gate_a * self.dropout(self.out(seen.transpose(1, 2).reshape(batch, tokens, width)))
         normal = F.layer_norm(x, (width,)) * (1 + scale_p) + shift_p
-        return x + gate_p * self.perceptron(normal)
+        return x + gate_p * self.dropout(self.perceptron(normal))
 
 
 class TokenTransformer(nn.Module):
-    """The velocity of tokens, given where they stand, the time and a class.
+    """The velocity of tokens that fill a cube, given the time and a class.
 
     Args:
         values: numbers per token.
-        per_side: places per side of the cube.
+        per_side: tokens per side of the cube.
         classes: one more is added, which stands for none.
+        dropout: of what each half of a block adds, while training.
     """
 
-    def __init__(self, values: int, per_side: int, classes: int, width: int, depth: int, heads: int):
+    def __init__(self, values: int, per_side: int, classes: int, width: int, depth: int, heads: int,
+                 dropout: float = 0.0):
         super().__init__()
         self.width, self.per_side = width, per_side
         self.into = nn.Linear(values, width)
-        self.place = nn.ModuleList(nn.Embedding(per_side, width) for _ in range(3))
+        self.place = nn.Parameter(torch.zeros(per_side**3, width))
         self.kind = nn.Embedding(classes + 1, width)
         self.condition = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
-        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
+        self.blocks = nn.ModuleList(Block(width, heads, dropout) for _ in range(depth))
         self.shared = nn.Linear(width, 6 * width)
         self.modulation = nn.Linear(width, 2 * width)
         self.out = nn.Linear(width, values)
-        for table in (*self.place, self.kind):
-            nn.init.normal_(table.get_parameter("weight"), std=0.02)
+        nn.init.normal_(self.place, std=0.02)
+        nn.init.normal_(self.kind.weight, std=0.02)
         for layer in (self.shared, self.modulation, self.out):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
-    def forward(self, x: Tensor, place: Tensor, present: Tensor, t: Tensor, kind: Tensor) -> Tensor:
+    def forward(self, x: Tensor, t: Tensor, kind: Tensor) -> Tensor:
         """(B, T, values) velocities.
 
         Args:
-            x: (B, T, values).
-            place: (B, T) numbers of places, x fastest.
-            present: (B, T), False for tokens that only fill the batch.
+            x: (B, T, values), the tokens in the order of their places.
             t: (B,) in [0, 1].
             kind: (B,).
         """
-        h = self.into(x)
-        for axis, table in enumerate(self.place):
-            h = h + table(place // self.per_side**axis % self.per_side)
+        h = self.into(x) + self.place
         condition = F.silu(self.condition(time_features(t, self.width)) + self.kind(kind))
         shared = self.shared(condition).view(len(x), 6, self.width)
         for block in self.blocks:
-            h = block(h, shared, present)
+            h = block(h, shared)
         shift, scale = self.modulation(condition)[:, None].chunk(2, dim=2)
         return self.out(F.layer_norm(h, (self.width,)) * (1 + scale) + shift)
