@@ -20,8 +20,8 @@ SHORT = ("--openings.iterations", "100", "--radiance.batch", "16384", "--radianc
          "--model.light-height", "8", "--no-report")
 
 #: Added to these where openings do not matter: hardly any steps, and the template stays closed.
-CLOSED = ("--openings.iterations", "5", "--openings.rounds", "0", "--openings.no-revise",
-          "--cavities.iterations", "4", "--refinement.iterations", "2")
+CLOSED = ("--openings.iterations", "5", "--openings.rounds", "0",
+          "--cavities.iterations", "4", "--refinement.iterations", "2", "--openings.no-revise")
 
 
 def half_sphere(segments: int = 32) -> trimesh.Trimesh:
