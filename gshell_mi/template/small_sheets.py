@@ -52,8 +52,8 @@ def small_sheets(moved: np.ndarray, normals: np.ndarray, faces: np.ndarray, othe
 
 
 def loose_sheets(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, opened: np.ndarray,
-                 cell: float) -> np.ndarray:
-    """(V,) one side of each small part that is a closed sheet, unless the whole surface is closed.
+                 cell: float) -> tuple[np.ndarray, np.ndarray]:
+    """One side (V,) of each small part that is a closed sheet, and both (V,); none if the surface is closed.
 
     What such a part borders of openings must be small beside it, as a neck that has been cut, by which the
     template joins it to more than itself.
@@ -65,7 +65,7 @@ def loose_sheets(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, o
         cell: side of a lattice cell, in the unit of the vertices.
     """
     if opened.all() or not opened.any():
-        return np.zeros(len(vertices), bool)
+        return np.zeros(len(vertices), bool), np.zeros(len(vertices), bool)
     areas = vertex_areas(vertices, faces)
     whole, faces = areas.sum(), faces[~opened[faces].any(axis=1)]
     part = mesh_components(faces, len(vertices))
@@ -75,4 +75,5 @@ def loose_sheets(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, o
     # Any flat piece has twice that rim or more.
     left_out = ((area > _LOOSE * whole) | (rim**2 >= np.pi * area))[part]
     left_out |= np.bincount(faces.ravel(), minlength=len(vertices)) == 0
-    return small_sheets(vertices, normals, faces, left_out, _SHEET * cell)[0]
+    side, _ = small_sheets(vertices, normals, faces, left_out, _SHEET * cell)
+    return side, np.isin(part, part[side])

@@ -7,10 +7,11 @@ import numpy as np
 
 from ..fields import LatticeFields
 from ..fields.smoothing import MeshDiffusion
-from ..triangles import area_vectors, unit
+from ..topology import equal_patches
+from ..triangles import area_vectors, unit, vertex_areas
 from ..views import PinholeViews
 from ..visibility import best_view
-from .msdf import clean_opacity, reopened, rewritten
+from .msdf import reopened, rewritten
 
 #: What is seen at this cosine or less is as good as unseen: a hull ends in surfaces that views only graze.
 _GRAZING = 0.2
@@ -38,8 +39,9 @@ def without_unseen(subject: mi.Shape, fields: LatticeFields, views: PinholeViews
     centers, normals = places[cells].mean(axis=1), unit(area_vectors(places, cells))
     known = np.zeros(len(places), bool)
     known[cells[best_view(centers, normals, (vertices, faces), views) > _GRAZING]] = True
-    # Patches of less than the area flip back.
-    unseen = clean_opacity(np.where((values > 0) & ~known, -1.0, 1.0), places, cells, min_area) < 0
+    hidden, area = (values > 0) & ~known, vertex_areas(places, cells)
+    patch = equal_patches(hidden, cells)
+    unseen = hidden & (np.bincount(patch, area)[patch] > min_area * area.sum())
     if not unseen.any():
         return None
     smooth = MeshDiffusion(cells, len(places), _SMOOTHING)

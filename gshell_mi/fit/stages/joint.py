@@ -24,6 +24,7 @@ from ...template.msdf_transfer import transfer_msdf
 from ..bounds import Between
 from ..joint.joint import JointStage
 from ..runner import Steps
+from ..sheets import with_open_sheets
 from ..stage import Fit
 from ..surface import TYPICAL_REFLECTANCE, Surface
 from ..unseen import without_unseen_parts
@@ -120,8 +121,9 @@ class Joint:
         steps.run(joint, self.iterations, joint.optimizers, lambda: _prefixed(
             _BLOCKS, block_arrays(subject.fields())))
         joint.finish()
-        return without_unseen_parts(fit, replace(surface, fields=joint.moved_fields(), hull=None, moved=(),
-                                                 model=joint.model(), settled=True))
+        result = replace(surface, fields=joint.moved_fields(), hull=None, moved=(), model=joint.model(),
+                         settled=True)
+        return with_open_sheets(fit, without_unseen_parts(fit, result))
 
 
 def start_fields(subject: mi.Shape, surface: Surface, lattice: Lattice, band_resolution: int,

@@ -17,7 +17,6 @@ import numpy as np
 from ...fields.smoothing import MeshDiffusion
 from ...template.msdf import clean_opacity, reopened, rewritten
 from ...template.sides import opposite_sides
-from ...template.small_sheets import loose_sheets
 from ...topology import lobes
 from ...triangles import positive_part
 from ..judge import places_of
@@ -55,15 +54,14 @@ class Revision:
         appearance = SurfaceRadiance(vertices, faces, fit.views, fit.pixels, fit.config.radiance,
                                      seed=fit.config.seed, mirrored=mirrored)
         steps.run(OpacityTraining(appearance, self.config), count, {"radiance": appearance.optimizer})
-        mesh, cell = (vertices, faces), fit.cell(surface)
+        mesh = vertices, faces
         with steps.task("verdict"):
             proposed = appearance.smoothed_logits()
-            thickness, opposite = opposite_sides(vertices, vertices, faces, cell)
+            thickness, opposite = opposite_sides(vertices, vertices, faces, fit.cell(surface))
             thin = np.isfinite(thickness)
             revised = _closed(fit, mesh, values, proposed, np.where(thin, opposite, -1))
             revised = _opened(fit, mesh, revised, proposed, thin)
-            side = loose_sheets(vertices, template.vertex_normals().numpy().T, faces, revised <= 0, cell)
-            revised = clean_opacity(np.where(side, -1.0, revised), *mesh, fit.config.topology.min_area)
+            revised = clean_opacity(revised, *mesh, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
         steps.fact("openings_changed", bool(changed.any()))
         if not changed.any():
