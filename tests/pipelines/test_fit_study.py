@@ -31,7 +31,7 @@ from fit_study.trials import Outcome, Trial, is_done, load_outcome, run_trial, r
 
 #: The options of a fit that is over at once, whose openings do not matter, as NAME=VALUE.
 _OPTIONS = [*SHORT[:-1], *CLOSED[:-1], "--iterations", "2"]
-QUICK = ["openings.revise=False"] + [f"{flag[2:].replace('-', '_')}={value}"
+QUICK = ["openings.revise=false"] + [f"{flag[2:].replace('-', '_')}={value}"
          for flag, value in dict(zip(_OPTIONS[::2], _OPTIONS[1::2], strict=True)).items()]
 
 

@@ -1,5 +1,7 @@
 """What no view sees is opened."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -44,6 +46,18 @@ def test_the_underside_of_a_ball_seen_from_above(subject):
     horizon = RADIUS * np.sin(ELEVATION - (np.arccos(0.2) - at_camera))
     assert np.abs(rim[:, 2] - horizon).max() < 1.5 * LATTICE.spacing
     assert vertices[:, 2].max() > 0.99 * RADIUS
+
+
+def test_a_small_part_that_is_seen_stays(subject):
+    """A ball of 1.5 % of the area, over the other one: its own piece, and smaller than what is opened."""
+    ball = sphere(LATTICE, RADIUS)
+    above = np.linalg.norm(LATTICE.vertex_positions() - [0, 0, 0.8], axis=1) - 0.075
+    both = replace(ball, sdf=np.minimum(ball.sdf, above.astype(np.float32)))
+    msdf = without_unseen(subject, both, views(ELEVATION), 0.02)
+    subject.set_fields(replace(both, msdf=msdf.numpy()))
+    vertices, faces, _ = subject.surface.to_numpy()
+    assert topology(vertices, faces).components == 2
+    assert vertices[:, 2].max() > 0.85 and vertices[:, 2].min() > -0.5
 
 
 @pytest.mark.parametrize(("elevation", "min_area"), [(0.0, 0.05), (ELEVATION, 0.5)])
