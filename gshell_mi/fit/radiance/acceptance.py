@@ -11,8 +11,11 @@ from ...triangles import positive_part
 from ..judge import Judge, places_of
 from .shown import Mesh, Shown
 
-#: Rounds in which openings are closed, each time those that are this near to the worst; in the last one all.
-_CLOSINGS, _WORST = 7, 0.5
+#: Rounds in which openings are closed; in the last one all that are rejected.
+_CLOSINGS = 7
+
+#: Openings that are this near to the worst close together.
+WORST = 0.5
 
 #: Lambda that smooths what single vertices tell along the mesh: a vertex is met by some hundred rays.
 _SMOOTHING = 10.0
@@ -80,7 +83,7 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge, before: Sho
         # The worst first; all where none is worse but some are not surely better, and in the last round.
         if closing:
             loss = np.where(worst, np.maximum(-verdict.gain, 0), 0)
-            worst &= loss >= _WORST * loss.max()
+            worst &= loss >= WORST * loss.max()
         rejected = kept & worst[place]
         if not rejected.any():
             break

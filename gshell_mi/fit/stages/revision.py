@@ -20,7 +20,7 @@ from ...template.sides import opposite_sides
 from ...topology import lobes
 from ...triangles import positive_part
 from ..judge import places_of
-from ..radiance.acceptance import close_rejected, close_shallow
+from ..radiance.acceptance import WORST, close_rejected, close_shallow
 from ..radiance.shown import Mesh
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
@@ -30,9 +30,6 @@ from .openings import OpacityTraining, OpeningsConfig, justified
 
 #: Lambda that smooths new rims along the template.
 _SMOOTHING = 3.0
-
-#: Openings close together that are this near to the worst.
-_WORST = 0.5
 
 
 class Revision:
@@ -96,7 +93,7 @@ def _closed(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.ndarray,
             gain = np.where(verdict.accepted & alone, verdict.gain, 0)
             if not gain.any():
                 break
-            values = np.where(chosen & (gain >= _WORST * gain.max())[place], -values, values)
+            values = np.where(chosen & (gain >= WORST * gain.max())[place], -values, values)
     return values
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,12 +18,11 @@ from torch import Tensor, nn
 from ..encodings import BLOCK
 from ..model_config import ModelConfig
 from .autoencoder import Autoencoder
+from .coded_set import CodedSet
 from .steering import Steering
 from .training_set import TrainingSet
 from .transformer import TokenTransformer
 
-#: How often a class is left out in training, so that the model knows the mean over all.
-_DROPPED = 0.1
 #: Of the transformer's blocks, while training: sets of thousands are small for it.
 _DROPOUT = 0.1
 #: Objects per step of the flow, for each of the autoencoder's, which has hundreds of times the work with one.
@@ -33,19 +31,6 @@ _MORE_LATENTS = 8
 _BLEND_CELLS = 2.0
 #: Fields are encoded and decoded so many at once.
 _CHUNK = 16
-
-
-@dataclass
-class Latents:
-    """A training set as latents."""
-
-    values: Tensor
-    """(n, tokens, values per token) float16."""
-    kinds: Tensor
-    """(n,)."""
-
-    def __len__(self) -> int:
-        return len(self.kinds)
 
 
 class LatentFlow(nn.Module):
@@ -81,28 +66,22 @@ class LatentFlow(nn.Module):
         return batch if stage == "autoencoder" else _MORE_LATENTS * batch
 
     @torch.no_grad()
-    def prepare(self, stage: str, data: TrainingSet) -> TrainingSet | Latents:
+    def prepare(self, stage: str, data: TrainingSet) -> TrainingSet | CodedSet:
         """What a stage draws its batches from."""
         if stage == "autoencoder":
             return data
         kept = [self._tokens(self.autoencoder.encode(part)).half() for part in data.parts(
             _CHUNK, self.autoencoder.mean.device)]
-        return Latents(torch.cat(kept), data.kinds.to(kept[0].device))
+        return CodedSet(torch.cat(kept), data.kinds.to(kept[0].device))
 
-    def draw(self, stage: str, data: TrainingSet | Latents, chosen: Tensor,
+    def draw(self, stage: str, data: TrainingSet | CodedSet, chosen: Tensor,
              generator: torch.Generator) -> dict[str, Tensor]:
         """A batch of the rows ``chosen``, with all its chance, on the generator's device."""
-        device, count = generator.device, len(chosen)
         if isinstance(data, TrainingSet):
-            n = self.per_side
+            device, size = generator.device, (len(chosen), self.channels, *3 * (self.per_side,))
             return {"fields": data.fields(chosen, device),
-                    "noise": torch.randn((count, self.channels, n, n, n), generator=generator, device=device)}
-        x = data.values[chosen.to(data.values.device)].to(device).float()
-        dropped = torch.rand(count, generator=generator, device=device) < _DROPPED
-        return {"x": x, "noise": torch.randn(x.shape, generator=generator, device=device),
-                "t": torch.sigmoid(torch.randn(count, generator=generator, device=device)),
-                "kinds": torch.where(dropped, len(self.config.classes),
-                                     data.kinds[chosen.to(data.kinds.device)].to(device))}
+                    "noise": torch.randn(size, generator=generator, device=device)}
+        return data.draw(chosen, len(self.config.classes), generator)
 
     def forward(self, batch: dict[str, Tensor]) -> Tensor:
         """The autoencoder's error, or the mean squared one of the velocity."""

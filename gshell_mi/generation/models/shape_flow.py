@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,12 +17,11 @@ from torch import Tensor, nn
 
 from ..fields import TRUNCATION_CELLS
 from ..model_config import ModelConfig
+from .coded_set import CodedSet
 from .perceptron import Perceptron
 from .steering import Steering
 from .training_set import TrainingSet
 
-#: How often a class is left out in training, so that the model knows the mean over all.
-_DROPPED = 0.1
 _DROPOUT = 0.1
 #: Nodes per side of the spline, at most.
 _NODES = 32
@@ -40,19 +38,6 @@ _KNOWN_VARIANCE = 1e-4
 _LEVELS = 127
 #: Fields that are looked at at once.
 _CHUNK = 16
-
-
-@dataclass
-class Points:
-    """A training set as points in the space of components."""
-
-    values: Tensor
-    """(n, components)."""
-    kinds: Tensor
-    """(n,)."""
-
-    def __len__(self) -> int:
-        return len(self.kinds)
 
 
 class ShapeFlow(nn.Module):
@@ -102,13 +87,13 @@ class ShapeFlow(nn.Module):
         return _MORE * batch
 
     @torch.no_grad()
-    def prepare(self, stage: str, data: TrainingSet) -> Points:
+    def prepare(self, stage: str, data: TrainingSet) -> CodedSet:
         """A set as points; the first one gives the components."""
         device = self.mean.device
         nodes = torch.cat([self._to_nodes(part) for part in data.parts(_CHUNK, device)])
         if not bool(self.scale.any()):
             self._find_components(nodes)
-        return Points((nodes - self.mean) @ self._inverse(), data.kinds.to(device))
+        return CodedSet((nodes - self.mean) @ self._inverse(), data.kinds.to(device))
 
     def _find_components(self, nodes: Tensor) -> None:
         self.mean.copy_(nodes.mean(dim=0).half())  # as it is stored
@@ -136,15 +121,10 @@ class ShapeFlow(nn.Module):
         basis = self._basis()
         return (basis / basis.square().sum(dim=1, keepdim=True).clamp(min=1e-12)).T
 
-    def draw(self, stage: str, data: Points, chosen: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+    def draw(self, stage: str, data: CodedSet, chosen: Tensor,
+             generator: torch.Generator) -> dict[str, Tensor]:
         """A batch of the rows ``chosen``, with all its chance, on the generator's device."""
-        device, count = generator.device, len(chosen)
-        chosen = chosen.to(data.values.device)
-        x = data.values[chosen].to(device)
-        dropped = torch.rand(count, generator=generator, device=device) < _DROPPED
-        return {"x": x, "noise": torch.randn(x.shape, generator=generator, device=device),
-                "t": torch.sigmoid(torch.randn(count, generator=generator, device=device)),
-                "kinds": torch.where(dropped, len(self.config.classes), data.kinds[chosen].to(device))}
+        return data.draw(chosen, len(self.config.classes), generator)
 
     def forward(self, batch: dict[str, Tensor]) -> Tensor:
         """The mean squared error of the velocity. Components count as much as they stretch over the set."""
