@@ -7,7 +7,7 @@ class Silent:
     """Steps of which only the facts are kept."""
 
     def __init__(self):
-        self.facts = {}
+        self.facts, self.kept, self.done = {}, {}, 0
 
     @contextmanager
     def task(self, name="", total=None):

@@ -10,8 +10,12 @@ import numpy as np
 from ..fields import LatticeFields
 from ..lattice import GRIDS, BlockLattice, Lattice
 
-#: Median reflectance that the first split of radiance into material and light assumes.
-TYPICAL_REFLECTANCE = 0.5
+#: Reflectances that the first split of radiance into material and light assumes: the median one, and what that
+#: of the brightest parts does not exceed. White paint reflects as much.
+TYPICAL_REFLECTANCE, _WHITE = 0.5, 0.8
+
+#: Share of a surface that is not brighter than its brightest parts.
+_BRIGHTEST = 0.98
 
 #: Lattice fields that are always there, and those that some surfaces have.
 _FIELDS, _OPTIONAL = ("sdf", "msdf", "deform"), ("weights", "blocks")
@@ -33,6 +37,18 @@ class Seen:
     radiance: np.ndarray
     known: np.ndarray
     light: np.float32
+
+    @staticmethod
+    def even_light(radiance: np.ndarray) -> np.float32:
+        """Brightness of the darkest even light that explains radiance, (V, 3), as of what is of a usual kind.
+
+        Were it as dark as the median alone tells, what is white on something black could not be explained: no
+        reflectance exceeds 1. Where nothing is seen it is 1.
+        """
+        if not len(radiance):
+            return np.float32(1)
+        typical = np.median(radiance.mean(axis=1)) / TYPICAL_REFLECTANCE
+        return np.float32(max(typical, np.quantile(radiance.max(axis=1), _BRIGHTEST) / _WHITE))
 
 
 @dataclass(frozen=True)

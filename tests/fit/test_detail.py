@@ -6,12 +6,22 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from bowl import CLOSED, RADIUS, SHORT
+from silent_steps import Silent
 
-from gshell_mi.fields import LatticeFields
+from gshell_mi.fields import LatticeFields, sphere
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.joint.joint import JointStage
-from gshell_mi.fit.stages.joint import DetailConfig, JointConfig, start_fields, start_light, start_material
+from gshell_mi.fit.lattices import Lattices
+from gshell_mi.fit.stage import Fit
+from gshell_mi.fit.stages.joint import (
+    DetailConfig,
+    Joint,
+    JointConfig,
+    start_fields,
+    start_light,
+    start_material,
+)
 from gshell_mi.fit.surface import Seen, Surface
 from gshell_mi.lattice import FlexiCubesLattice
 from gshell_mi.light import EnvironmentLight
@@ -81,3 +91,17 @@ def test_when_there_is_one(bowl_scene, tmp_path, arguments, stages):
     assert {stage: log.count(stage) for stage in ("joint", "detail") if stage in log} == stages
     seconds = json.loads((tmp_path / "metrics.json").read_text())["seconds"]
     assert ("detail" in seconds) == ("detail" in stages)
+
+
+def test_it_goes_over_a_surface_in_blocks_again(bowl_scene):
+    """One as fine already, which has changed since material and light were fitted to it."""
+    config = CONFIG.changed({"detail.iterations": 1, "lattice.band_resolution": 40})
+    scene, lattice = load_fit_scene(bowl_scene), FlexiCubesLattice(40)
+    fields = sphere(lattice, RADIUS).in_blocks()
+    count = len(fields.sdf)
+    surface = Surface(fields, seen=Seen(np.full((count, 3), 0.5), np.full(count, True), np.float32(1)))
+    fit = Fit(scene, config, Lattices.of(scene.subject, config))
+    stage = Joint("detail", config.detail, 1, FlexiCubesLattice(40), refines=True)
+    found = stage.run(fit, surface, Silent())
+    assert found.settled and found.lattice == surface.lattice
+    assert stage.run(fit, found, Silent()) is found

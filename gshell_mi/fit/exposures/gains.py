@@ -13,9 +13,13 @@ from .observations import REGIONS, Observations
 #: Steps of the robust regression, each of which weighs by the residuals of the one before.
 _STEPS = 6
 
-#: Degrees of the polynomials of a mirrored direction and a normal, which tell gloss and a light that turns
-#: with the camera, and of the direction to the camera, which tells a look.
-_GLOSSY, _LOOK = 3, 2
+#: Degree of the polynomials of a mirrored direction and a normal, which tell gloss and a light that turns with
+#: the camera.
+_GLOSSY = 3
+
+#: Angles between views, in degrees, over which a look may change, and shares of a gain's variance that it may
+#: be. Views of a capture are rarely nearer to each other than the least angle.
+_ANGLES, _SHARES = (20.0, 30.0, 45.0, 60.0, 90.0), np.linspace(0.0, 0.98, 50)
 
 #: Standard deviation of their coefficients before anything was seen.
 _FREE = 1.0
@@ -34,7 +38,7 @@ class Gains:
     Attributes:
         log_gain: (N, 3) natural logarithms of what multiplies each view's channels; 0 in the mean.
         noise: (N, 3) standard errors, by leaving out one region of the surface after the other.
-        look: whether views from the same side differ alike, which is no exposure; then that is left out.
+        look: whether neighbouring views differ alike, which is no exposure; then that is left out.
         verdict: whether the gains that the rest of the surface tells explain each region.
     """
 
@@ -57,9 +61,9 @@ def find_gains(seen: Observations, prior: float) -> Gains:
     gain is what views disagree by on places that both see, as far as gloss does not explain it. Views that
     share no places with others have no gain.
 
-    Metal, or a shape that is not right yet, looks darker from one side than from another. If the gains of the
-    other views foretell that of a view by where it looks from, better than by chance, all that depends on it
-    smoothly is a look.
+    Metal, or a shape that is not right yet, looks darker from one side than from another, and neighbouring
+    views look alike. Exposures do not know of each other. So gains are the sum of a random function of where
+    views look from, and of exposures (kriging with a nugget; Matheron 1963).
 
     An exposure is the same all over an image. So each region of the surface is foretold by the others, and
     the judge's rule decides: the error of a view's sightings there, with gains and without, has to fall by
@@ -73,12 +77,9 @@ def find_gains(seen: Observations, prior: float) -> Gains:
     """
     columns = [_polynomials(vectors, _GLOSSY) for vectors in (seen.mirrored, seen.normal)]
     model = _Model(seen, np.concatenate(columns, axis=1), prior)
-    gains = model.gains()
-    look = _is_look(gains, seen)
-    if look:
-        columns.append(_polynomials(_toward(seen), _LOOK)[seen.view])
-        model = _Model(seen, np.concatenate(columns, axis=1), prior)
-        gains = model.gains()
+    views = np.unique(seen.view)
+    gains = np.zeros((seen.views, 3))
+    gains[views], look = _without_look(model.gains()[views], _toward(seen)[views])
     noise, verdict = model.foretold()
     variance = min((gains**2 - noise**2).mean(), prior**2)
     if variance <= _CLEAR * (noise**2).mean():
@@ -171,18 +172,26 @@ def _residual(seen: Observations, columns: np.ndarray, channel: int, weight: np.
     return left - seen.places.T @ color
 
 
-def _is_look(gains: np.ndarray, seen: Observations) -> bool:
-    """Whether the gains of the other views foretell that of a view by where it looks from."""
-    views = np.unique(seen.view)
-    if not len(views):
-        return False
-    columns = np.concatenate([np.ones((len(views), 1)), _polynomials(_toward(seen)[views], _LOOK)], axis=1)
-    # Residuals of a linear regression without the view itself, by its leverage.
-    projection = columns @ np.linalg.pinv(columns)
-    leverage = np.minimum(np.diag(projection), 1 - 1e-6)
-    left = (gains[views] - projection @ gains[views]) / (1 - leverage[:, None])
-    before, after = (np.abs(values).sum(axis=1) for values in (gains[views], left))
-    return bool(verdict_of(np.ones((1, len(views))), before[None], after[None]).accepted[0])
+def _without_look(gains: np.ndarray, toward: np.ndarray) -> tuple[np.ndarray, bool]:
+    """What of (N, 3) gains does not depend on where the views look from, and whether anything does.
+
+    Angle and share are the likeliest ones, if they are worth two parameters (Schwarz 1978).
+    """
+    count = gains.size
+    if not count:
+        return gains, False
+    gains = gains - gains.mean(axis=0)
+    likeliest, found = -count * np.log((gains**2).mean() + _EXACT**2) + 2 * np.log(count), None
+    for angle in _ANGLES:
+        alike = np.exp((toward @ toward.T - 1) / np.radians(angle) ** 2)
+        size, basis = np.linalg.eigh(alike)
+        parts = basis.T @ gains
+        for share in _SHARES[1:]:
+            variance = (share * np.maximum(size, 0) + 1 - share)[:, None]
+            likelihood = -count * np.log((parts**2 / variance).mean() + _EXACT**2) - 3 * np.log(variance).sum()
+            if likelihood > likeliest:
+                likeliest, found = likelihood, basis @ ((1 - share) * parts / variance)
+    return (gains, False) if found is None else (found, True)
 
 
 def _toward(seen: Observations) -> np.ndarray:

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
+from ...fields import LatticeFields
 from ...fields.depth_fusion import fused_distance
 from ...fields.lattice_fields import closed_at_border
-from ...fields.smoothing import MeshDiffusion
 from ...fields.visual_hull import visual_hull
 from ...lattice import Lattice
 from ...scene import FitScene
+from ...template.msdf import splat_to_lattice
 from ...template.sides import normals_at_vertices
-from ..template import Template, closed_template
+from ..surface import Seen, Surface
+from ..template import closed_template
 from .volume import RadianceVolume
 
-#: The template is this far outside of what is there, in cells: a sheet, which is seen from both sides, has no
-#: inside, and a lattice holds nothing thinner than about a cell.
+#: The surface is this far outside of what is there, in cells: a sheet, which is seen from both sides, has no
+#: inside, and a lattice holds nothing thinner than about a cell. The joint stage takes it back where it can.
 _MARGIN = 0.6
 
 #: Largest distance that is told from others, in cells.
@@ -36,28 +37,10 @@ _COVERED = 0.5
 #: What floats and has fewer lattice vertices than a ball of this radius, in cells, is noise.
 _FLOATER = 2.0
 
-#: Lambda that smooths the way back along the template.
-_SMOOTHING = 1.0
 
-
-@dataclass(frozen=True)
-class VolumeSurface:
-    """A closed template around a volume's surface.
-
-    Attributes:
-        template: outside of it.
-        positions: (V, 3) where the template's vertices belong. Both sides of a sheet are in one place.
-        radiance: (V, 3) there.
-    """
-
-    template: Template
-    positions: np.ndarray
-    radiance: np.ndarray
-
-
-def volume_surface(volume: RadianceVolume, scene: FitScene, lattice: Lattice,
-                   progress: Callable[[], None] = lambda: None) -> VolumeSurface | None:
-    """Finds the surface of a trained volume.
+def volume_surface(volume: RadianceVolume, scene: FitScene, lattice: Lattice, light: np.float32,
+                   progress: Callable[[], None] = lambda: None) -> Surface | None:
+    """Finds the surface of a trained volume. It is closed, and a little outside of what is there.
 
     Every view tells how deep it sees, where its mask does not say that it sees nothing. What no view looks
     through is there (``fused_distance``), within the visual hull.
@@ -66,6 +49,7 @@ def volume_surface(volume: RadianceVolume, scene: FitScene, lattice: Lattice,
         volume: trained.
         scene: its subject is left with other fields.
         lattice: whose vertices make a cube.
+        light: of what was seen.
         progress: called without arguments after each view.
 
     Returns:
@@ -91,13 +75,11 @@ def volume_surface(volume: RadianceVolume, scene: FitScene, lattice: Lattice,
     if not (sdf < 0).any():
         return None
     mesh, vertices, faces = closed_template(subject, sdf, lattice)
-    # Smoothed positions would shrink rims.
-    smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
-    inwards = [smooth(mi.Float(np.ascontiguousarray(column, np.float32))).numpy()
-               for column in normals_at_vertices(vertices, faces).T]
-    back = vertices - margin * cell * np.stack(inwards, axis=1)
-    template = Template(mesh, vertices, faces, np.ones(len(vertices)), back)
-    return VolumeSurface(template, back, volume.radiance_at(back))
+    # What it shows is where it is.
+    inside = vertices - margin * cell * normals_at_vertices(vertices, faces)
+    radiance, known = splat_to_lattice(mi.Float(volume.radiance_at(inside).ravel()), mesh, lattice)
+    seen = Seen(radiance.numpy().reshape(-1, 3), known.numpy(), light)
+    return Surface(LatticeFields.closed(sdf, lattice.grid), seen=seen)
 
 
 def _without_specks(distance: np.ndarray, level: float) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...fields import LatticeFields
 from ...fields.interpolation import Interpolation
-from ...lattice import BlockLattice, Lattice, lattice_of
+from ...lattice import BlockLattice, Lattice, lattice_of, make_lattice
 from ...light import EnvironmentLight
 from ...material import GivenMaterial, MaterialField, given_material
 from ...scene import FitScene
@@ -105,7 +105,7 @@ class Joint:
         if surface.lattice.resolution >= lattice.resolution:
             if self.refines and surface.settled:
                 return surface
-            lattice = surface.on_grid(lattice.grid).lattice
+            lattice = make_lattice(lattice.grid, surface.lattice.resolution)
         subject, config = fit.scene.subject, fit.config
         fields = start_fields(subject, surface, lattice, config.lattice.band_resolution, steps.kept)
         subject.set_fields(fields)
@@ -140,6 +140,8 @@ def start_fields(subject: mi.Shape, surface: Surface, lattice: Lattice, band_res
     if stored := _under(kept, _BLOCKS):
         return LatticeFields(**stored, grid=lattice.grid, block_resolution=lattice.resolution)
     fields = surface.on_grid(lattice.grid).fields
+    if fields.blocks is not None and fields.lattice.resolution == lattice.resolution:
+        return fields
     in_blocks = lattice.resolution >= band_resolution and lattice.fits_in_blocks
     if fields.lattice == lattice:
         return fields.in_blocks() if in_blocks else fields

@@ -32,7 +32,7 @@ from ..radiance.shown import Mesh, Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
 from ..stage import Fit
-from ..surface import TYPICAL_REFLECTANCE, Seen, Surface
+from ..surface import Seen, Surface
 from ..template import template_of
 
 #: Logits below which connected parts are proposed as openings, one after the other as long as some are
@@ -101,8 +101,7 @@ class Openings:
         front, _ = appearance.radiance()
         msdf = msdf_from_template(logits, template.mesh, surface.lattice)
         radiance, known = splat_to_lattice(mi.Float(front.ravel()), template.mesh, surface.lattice)
-        light = np.float32(float(np.median(front[~opened].mean(axis=1))) / TYPICAL_REFLECTANCE)
-        seen = Seen(radiance.numpy().reshape(-1, 3), known.numpy(), light)
+        seen = Seen(radiance.numpy().reshape(-1, 3), known.numpy(), Seen.even_light(front[~opened]))
         return replace(surface.with_fields(msdf=msdf.numpy()), seen=seen)
 
 

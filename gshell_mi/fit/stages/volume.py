@@ -14,9 +14,8 @@ from ..radiance.volume import RadianceVolume
 from ..radiance.volume_surface import volume_surface
 from ..runner import Steps
 from ..stage import Fit
-from ..surface import Moved, Surface
+from ..surface import Surface
 from ..unseen import without_unseen_parts
-from .revoxelise import best_revoxelised
 
 
 class Volume:
@@ -34,11 +33,7 @@ class Volume:
         volume = self._volume(fit, before, steps.kept)
         steps.run(volume, self.config.iterations, volume.optimizers, volume.arrays)
         with steps.task("depth", len(fit.views)) as advance:
-            found = volume_surface(volume, fit.scene, lattice, advance)
-            if found is None:
-                return surface
-            moved = Moved(self.name, found.positions, found.radiance)
-            other, _ = best_revoxelised(fit, found.template, (moved,), lattice, surface.seen.light)
+            other = volume_surface(volume, fit.scene, lattice, surface.seen.light, advance)
         if other is None:
             return surface
         with steps.task("verdict"):
