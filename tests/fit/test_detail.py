@@ -1,6 +1,7 @@
 """The detail stage: the joint stage continued on a finer lattice."""
 
 import json
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -105,3 +106,7 @@ def test_it_goes_over_a_surface_in_blocks_again(bowl_scene):
     found = stage.run(fit, surface, Silent())
     assert found.settled and found.lattice.resolution == 40
     assert stage.run(fit, found, Silent()) is found
+    again = stage.run(fit, replace(found, settled=False), Silent())
+    assert again.settled and again.lattice.resolution == 40
+    colors = (surface.model["vertex_color"].reshape(-1, 3).mean(axis=0) for surface in (found, again))
+    np.testing.assert_allclose(*colors, atol=0.1, err_msg="the material goes on")

@@ -182,11 +182,13 @@ def start_material(scene: FitScene, surface: Surface, lattice: Lattice | BlockLa
 
 
 def _resampled_material(surface: Surface, lattice: Lattice | BlockLattice) -> MaterialField:
-    """The material that a joint stage has left, on another lattice."""
+    """The material that a joint stage has left, on another lattice; blocks are not resampled."""
     points = lattice.points(mi.Float)
     material = MaterialField(np.full((lattice.vertex_count, 3), TYPICAL_REFLECTANCE))
     material.parameters = {name: mi.Float(surface.model[name]) for name in material.parameters}
     before = surface.on_grid(lattice.grid).lattice
+    if isinstance(before, BlockLattice):
+        return material
     for name in material.on_lattice:
         material.parameters[name] = Interpolation(material.parameters[name], before)(points)
     return material
