@@ -10,8 +10,8 @@ import numpy as np
 from ..fields import LatticeFields
 from ..lattice import GRIDS, BlockLattice, Lattice
 
-#: Reflectances that the first split of radiance into material and light assumes: the median one, and what that
-#: of the brightest parts does not exceed. White paint reflects as much.
+#: Reflectances that the first split of radiance into material and light assumes: the median one, and what
+#: that of the brightest parts does not exceed. White paint reflects as much.
 TYPICAL_REFLECTANCE, _WHITE = 0.5, 0.8
 
 #: Share of a surface that is not brighter than its brightest parts.

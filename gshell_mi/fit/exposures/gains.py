@@ -13,8 +13,8 @@ from .observations import REGIONS, Observations
 #: Steps of the robust regression, each of which weighs by the residuals of the one before.
 _STEPS = 6
 
-#: Degree of the polynomials of a mirrored direction and a normal, which tell gloss and a light that turns with
-#: the camera.
+#: Degree of the polynomials of a mirrored direction and a normal, which tell gloss and a light that turns
+#: with the camera.
 _GLOSSY = 3
 
 #: Angles between views, in degrees, over which a look may change, and shares of a gain's variance that it may
@@ -177,7 +177,7 @@ def _without_look(gains: np.ndarray, toward: np.ndarray) -> tuple[np.ndarray, bo
 
     Angle and share are the likeliest ones, if they are worth two parameters (Schwarz 1978).
     """
-    count = gains.size
+    count, channels = gains.size, gains.shape[1]
     if not count:
         return gains, False
     gains = gains - gains.mean(axis=0)
@@ -188,7 +188,8 @@ def _without_look(gains: np.ndarray, toward: np.ndarray) -> tuple[np.ndarray, bo
         parts = basis.T @ gains
         for share in _SHARES[1:]:
             variance = (share * np.maximum(size, 0) + 1 - share)[:, None]
-            likelihood = -count * np.log((parts**2 / variance).mean() + _EXACT**2) - 3 * np.log(variance).sum()
+            volume = channels * np.log(variance).sum()
+            likelihood = -count * np.log((parts**2 / variance).mean() + _EXACT**2) - volume
             if likelihood > likeliest:
                 likeliest, found = likelihood, basis @ ((1 - share) * parts / variance)
     return (gains, False) if found is None else (found, True)

@@ -12,7 +12,6 @@ import mitsuba as mi
 import numpy as np
 
 from ...fields import LatticeFields
-from ...lattice import Lattice
 from ...template.msdf import clean_opacity
 from ...template.revoxelise import revoxelise
 from ...template.thin_sheets import Cut, collapsed_sheets
@@ -38,40 +37,28 @@ class Revoxelise:
             template = template_of(fit.scene.subject, surface)
             radiance = template.mesh.interpolate(mi.Float(surface.seen.radiance.ravel()), 3).numpy().T
             still = Moved("start", template.start, radiance)
-            found, taken = best_revoxelised(fit, template, (*surface.moved, still), surface.lattice,
-                                            surface.seen.light)
+            found, taken = _whole(fit, template, (*surface.moved, still), surface)
             steps.fact("refinement_kept", taken not in ("start", ""))
             if taken == "folds":
                 steps.fact("folds_kept", True)
             return without_unseen_parts(fit, found or replace(surface, hull=None, moved=()))
 
 
-def best_revoxelised(fit: Fit, template: Template, moved: Iterable[Moved], lattice: Lattice,
-                     light: np.float32) -> tuple[Surface | None, str]:
-    """The first movement of a template of which fields can be made, cut as well as can be.
-
-    Args:
-        fit: whose settings count.
-        template: before it moved.
-        moved: the best first.
-        lattice: of the fields.
-        light: of what was seen.
-
-    Returns:
-        The surface and the stage that has moved it; None and an empty name if none comes out whole.
-    """
-    subject, min_area = fit.scene.subject, fit.config.topology.min_area
+def _whole(fit: Fit, template: Template, moved: Iterable[Moved],
+           surface: Surface) -> tuple[Surface | None, str]:
+    """The first movement, of the best first, of which fields can be made, cut as well as can be, and its
+    stage; None and an empty name if none comes out whole."""
+    subject, lattice, min_area = fit.scene.subject, surface.lattice, fit.config.topology.min_area
     for candidate in moved:
         if (candidate.positions == template.vertices).all():
             continue
-        for cut in _cuts(fit, template, candidate.positions, lattice.spacing * subject.length_scale):
+        for cut in _cuts(fit, template, candidate.positions, fit.cell(surface)):
             fields = revoxelise(subject, lattice, template.vertices, cut.positions, template.faces,
                                 cut.logits, candidate.radiance, min_area, cut.topology, cut.fewest_loops)
             if fields:
                 closed = LatticeFields.closed(fields["sdf"], lattice.grid)
-                seen = Seen(fields["radiance"], fields["known"], light)
-                found = Surface(replace(closed, msdf=fields["msdf"]), seen=seen)
-                return found, candidate.stage
+                seen = Seen(fields["radiance"], fields["known"], surface.seen.light)
+                return Surface(replace(closed, msdf=fields["msdf"]), seen=seen), candidate.stage
     return None, ""
 
 

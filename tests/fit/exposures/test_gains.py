@@ -10,8 +10,8 @@ STOP = np.log(2)
 PRIOR = STOP / 3
 
 
-def sightings(stops: np.ndarray, *, gloss: float = 0.0, look: float = 0.0, flat: float = 0.0, overlap: bool = True,
-              lit: float = 0.0, seed: int = 0) -> Observations:
+def sightings(stops: np.ndarray, *, gloss: float = 0.0, look: float = 0.0, flat: float = 0.0,
+              overlap: bool = True, lit: float = 0.0, seed: int = 0) -> Observations:
     """Of a ball by views around it, noisy.
 
     Args:
