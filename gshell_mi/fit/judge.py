@@ -54,11 +54,6 @@ class Verdict:
         """(P,) whether the gain is no accident."""
         return self.gain > _SURE * self.noise
 
-    @property
-    def refused(self) -> np.ndarray:
-        """(P,) whether the loss is no accident."""
-        return self.gain < -_SURE * self.noise
-
     def facts(self) -> dict[str, list[float]]:
         """For ``metrics.json``: gain and noise of each place."""
         return {"gain": [round(float(value), 5) for value in self.gain],

@@ -39,7 +39,6 @@ class Outlines:
     def __init__(self, views: PinholeViews, targets: list[Target], faces: np.ndarray, solid: np.ndarray):
         self.views = views
         self._faces = mi.Vector3u(faces.T.astype(np.uint32))
-        self._vertex_count = len(solid)
         edges, _ = mesh_edges(faces)
         edges = edges[solid[edges].all(axis=1)]
         self._edges = mi.Vector2u(edges.T.astype(np.uint32))
