@@ -50,7 +50,7 @@ def coded(folder: Path, fields: np.ndarray) -> tuple[np.ndarray, int]:
     """
     import torch
 
-    from .training import load_model
+    from .model_folder import load_model
 
     model = load_model(folder, torch.device("cpu"))
     if model.config.model == "unet":

@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import UserError
+from .model_folder import load_model
 from .models import Steering
 from .request import Request
-from .training import load_model
 
 
 def sample_fields(folder: Path, request: Request) -> tuple[np.ndarray, float]:

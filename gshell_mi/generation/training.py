@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -26,9 +25,11 @@ from ..own_folder import OwnFolder, own_folder
 from ..wording import counted
 from .data_set import DataSet
 from .model_config import ModelConfig
+from .model_folder import check_same, load_model, write_card
 from .models import Steering, make_model
 from .models.training_set import TrainingSet
 from .own_process import in_own_process
+from .processes import Processes
 from .train_config import TrainConfig
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def train(data_set: Path, output: Path, config: TrainConfig, *, quiet: bool = Tr
         UserError: the set is missing or damaged, the folder is another's or holds another model, or the
             device has not enough memory.
     """
-    run = _Processes.start(config.device)
+    run = Processes.start(config.device)
     try:
         data = DataSet.open(data_set)
         made = ModelConfig(config.model, config.size, data.side, tuple(data.classes))
@@ -73,9 +74,9 @@ def train(data_set: Path, output: Path, config: TrainConfig, *, quiet: bool = Tr
             return _Training(config, made, run, None).run(training, None, quiet=True)
         output.mkdir(parents=True, exist_ok=True)
         with own_folder(output, "model") as folder:
-            _check_same(output, made, config, data)
+            check_same(output, made, config, data)
             folder.claim("model.json", "weights.safetensors", _CHECKPOINT, "log.jsonl")
-            _write_card(output, made, config, data)
+            write_card(output, made, config, data)
             return _Training(config, made, run, folder).run(training, tests, quiet=quiet)
     except torch.OutOfMemoryError as error:
         raise UserError(f"The device has not enough memory for batches of {config.batch}; give a smaller "
@@ -88,45 +89,6 @@ def _loaded(data: DataSet, config: TrainConfig, device: torch.device, *, held_ou
     records, sdf, msdf, _ = data.load(held_out=held_out)
     kinds = [data.classes.index(record.kind) for record in records]
     return TrainingSet(sdf, msdf, kinds, mirror=config.mirror and not held_out, device=device)
-
-
-@dataclass(frozen=True)
-class _Processes:
-    """The processes that ``torchrun`` started, or this one alone."""
-
-    rank: int
-    count: int
-    device: torch.device
-
-    @classmethod
-    def start(cls, device: str) -> _Processes:
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-        if device == "cuda" and not torch.cuda.is_available():
-            raise UserError("PyTorch finds no GPU; use --device cpu, or install PyTorch with CUDA.")
-        rank, count = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-        if device == "cuda":
-            device = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"
-            torch.cuda.set_device(device)
-        if count > 1:
-            distributed.init_process_group("nccl" if device.startswith("cuda") else "gloo")
-        return cls(rank, count, torch.device(device))
-
-    @property
-    def first(self) -> bool:
-        return self.rank == 0
-
-    def end(self) -> None:
-        if self.count > 1 and distributed.is_initialized():
-            distributed.destroy_process_group()
-
-    def agreed(self, flag: bool) -> bool:
-        """What the first process says."""
-        if self.count == 1:
-            return flag
-        told = torch.tensor([float(flag)], device=self.device)
-        distributed.broadcast(told, 0)
-        return bool(told.item())
 
 
 @dataclass(frozen=True)
@@ -143,7 +105,7 @@ class _Spent:
 class _Training:
     """The state of a training: of one stage after the other, each with its own optimizer and mean weights."""
 
-    def __init__(self, config: TrainConfig, made: ModelConfig, run: _Processes, folder: OwnFolder | None):
+    def __init__(self, config: TrainConfig, made: ModelConfig, run: Processes, folder: OwnFolder | None):
         torch.manual_seed(config.seed)
         self.config, self.made, self.processes, self.folder = config, made, run, folder
         self.model = make_model(made).to(run.device)
@@ -450,41 +412,3 @@ def _take_autoencoder(model: ShapeFlow | LatentFlow | DenseDiffusion, folder: Pa
         raise UserError(f"The autoencoder of '{folder}' is none for a model of this kind and size; give "
                         "another --size, or leave --autoencoder out.")
     model.autoencoder.load_state_dict(other.autoencoder.state_dict())
-
-
-def _check_same(output: Path, made: ModelConfig, config: TrainConfig, data: DataSet) -> None:
-    if not (output / "model.json").is_file():
-        return
-    old = ModelConfig.read(output / "model.json")
-    told = json.loads((output / "model.json").read_text(encoding="utf-8"))
-    if old != made or told.get("data") != data.config["digest"] or told.get("seed") != config.seed:
-        raise UserError(f"'{output}' holds a model of another kind, size, seed or data set; choose another "
-                        f"place with -o.")
-
-
-def _write_card(output: Path, made: ModelConfig, config: TrainConfig, data: DataSet) -> None:
-    card = {"config": made.to_dict(), "seed": config.seed, "data": data.config["digest"],
-            "objects": sum(not record.held_out for record in data.records),
-            "minutes": config.minutes, "steps": config.steps, "batch": config.batch, "rate": config.rate}
-    with replacing(output / "model.json") as partial:
-        partial.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-
-
-def load_model(folder: Path, device: torch.device) -> ShapeFlow | LatentFlow | DenseDiffusion:
-    """The trained model of a folder.
-
-    Raises:
-        UserError: there is none, or its files are damaged or do not fit together.
-    """
-    made = ModelConfig.read(folder / "model.json")
-    path = folder / "weights.safetensors"
-    if not path.is_file():
-        raise UserError(f"'{folder}' has no weights yet; train it with python -m gshell_mi.train.")
-    model = make_model(made)
-    try:
-        model.load_state_dict({name: value.float() if value.is_floating_point() else value
-                               for name, value in load_file(path).items()})
-    except Exception as error:
-        raise UserError(f"'{path}' does not hold the weights of the model that model.json describes "
-                        f"({type(error).__name__}); train it again.") from error
-    return model.to(device).eval()
