@@ -31,6 +31,19 @@ def existing(named: Path) -> Path | None:
     return next((folder / there[key] for key in keys if key in there), None)
 
 
+def entry_of(folder: Path, name: str) -> Path:
+    """The file or folder of that name, such as ``sparse/0``, or the one that differs in case only: a capture
+    may have been on a system that does not tell ``IMAGES.TXT`` from ``images.txt``. Where there is none, the
+    path that it would have."""
+    for part in PurePosixPath(name).parts:
+        path = folder / part
+        if not path.exists() and folder.is_dir():
+            path = next((other for other in sorted(folder.iterdir())
+                         if other.name.casefold() == part.casefold()), path)
+        folder = path
+    return folder
+
+
 def _existing_folder(named: Path) -> Path | None:
     if named.is_dir():
         return named

@@ -1,7 +1,10 @@
 """Which file a name means."""
 
+import numpy as np
 import pytest
+from known_capture import CAPTURES
 
+from gshell_mi.capture import read_capture
 from gshell_mi.capture.file_names import Copies, existing
 
 
@@ -54,3 +57,20 @@ def test_files_that_appear_later_are_seen(folder):
 def test_counterparts_in_another_folder(names, there, found, folder):
     place, copies = folder(*there), Copies(names)
     assert [copies.find(place, name) for name in names] == [place / name if name else None for name in found]
+
+
+@pytest.mark.parametrize("name", [name for name in CAPTURES if not name.startswith("mitsuba")])
+def test_a_capture_in_capitals(name, tmp_path):
+    """As it comes from a system that does not tell them from small letters."""
+    cameras, write = CAPTURES[name]
+    write(tmp_path, cameras)
+    expected = read_capture(tmp_path)
+    named = any(tmp_path.glob("transforms*.json"))
+    for path in sorted(tmp_path.rglob("*"), key=lambda path: -len(path.parts)):
+        # Images, and their folders where a document names them, keep their names.
+        if path.suffix in (".txt", ".bin", ".json", ".npz", ".npy") or (path.is_dir() and not named):
+            path.rename(path.with_name(path.name.upper()))
+    found = read_capture(tmp_path)
+    assert [frame.image.name for frame in found.frames] == [frame.image.name for frame in expected.frames]
+    for frame, other in zip(found.frames, expected.frames, strict=True):
+        np.testing.assert_array_equal(frame.camera.to_world, other.camera.to_world)

@@ -16,7 +16,7 @@ import numpy as np
 from ...errors import UserError
 from ..camera import Camera, Distortion
 from ..decoding import image_size
-from ..file_names import existing
+from ..file_names import entry_of, existing
 from ..frames import Capture, Frame, camera_for_image, pose_of
 
 #: Number in binary models, and how many parameters each has.
@@ -31,7 +31,7 @@ _PLACES = ("", "sparse", "colmap/sparse", "colmap")
 def find(source: Path) -> Path | None:
     """The folder of the model: the given one or its usual sub-folders; of several, that of most images."""
     for place in _PLACES:
-        models = _models(source / place)
+        models = _models(entry_of(source, place))
         if models:
             return max(models, key=_image_count) if len(models) > 1 else models[0]
     return None
@@ -41,7 +41,7 @@ def _models(folder: Path) -> list[Path]:
     """The folder itself, if it is a model, or the numbered ones in it, into which COLMAP splits its own."""
     if _suffix(folder):
         return [folder]
-    if folder.name != "sparse" or not folder.is_dir():
+    if folder.name.casefold() != "sparse" or not folder.is_dir():
         return []
     numbered = sorted((path for path in folder.iterdir() if path.name.isdecimal()), key=lambda p: int(p.name))
     return [path for path in numbered if _suffix(path)]
@@ -50,13 +50,13 @@ def _models(folder: Path) -> list[Path]:
 def _suffix(folder: Path) -> str | None:
     """Of the files of a model; the binary one if there are both."""
     return next((suffix for suffix in (".bin", ".txt")
-                 if all((folder / (name + suffix)).is_file() for name in ("cameras", "images"))), None)
+                 if all(entry_of(folder, name + suffix).is_file() for name in ("cameras", "images"))), None)
 
 
 def _image_count(model: Path) -> int:
     """Roughly, as the model may be malformed."""
-    file = model / f"images{_suffix(model)}"
-    if file.suffix == ".bin":
+    file = entry_of(model, f"images{_suffix(model)}")
+    if _suffix(model) == ".bin":
         with open(file, "rb") as stream:
             return int.from_bytes(stream.read(8), "little")
     with open(file, encoding="utf-8", errors="replace") as stream:
@@ -81,10 +81,11 @@ def read(source: Path, images: Path | None = None) -> Capture:
     others = [path for path in _models(model.parent) if path != model] if model != source else []
     notes = [f"'{model.parent}' has {len(others) + 1} models; '{model.name}' is taken, as it has the most "
              f"images: merge them in COLMAP (model_merger) for the others."] if others else []
+    cameras_file, images_file = (entry_of(model, f"{name}{_suffix(model)}") for name in ("cameras", "images"))
     if _suffix(model) == ".bin":
-        cameras, poses = _read_cameras_bin(model / "cameras.bin"), _read_images_bin(model / "images.bin")
+        cameras, poses = _read_cameras_bin(cameras_file), _read_images_bin(images_file)
     else:
-        cameras, poses = _read_cameras_txt(model / "cameras.txt"), _read_images_txt(model / "images.txt")
+        cameras, poses = _read_cameras_txt(cameras_file), _read_images_txt(images_file)
     if not poses:
         raise UserError(f"The COLMAP model in '{model}' has no images; run its mapper first.")
     frames = []
@@ -107,8 +108,8 @@ def _image(folder: Path, name: str) -> Path:
 
 def _image_folder(source: Path, model: Path) -> Path:
     for parent in (source, *model.resolve().parents[:3]):
-        if (parent / "images").is_dir():
-            return parent / "images"
+        if entry_of(parent, "images").is_dir():
+            return entry_of(parent, "images")
     raise UserError(f"The COLMAP model in '{model}' has no folder 'images' near it; name it with --images.")
 
 

@@ -15,6 +15,7 @@ from scipy.linalg import rq
 from ...errors import UserError
 from ..camera import Camera
 from ..decoding import image_size, images_in
+from ..file_names import entry_of
 from ..frames import Capture, Frame, camera_for_image, pose_of
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
@@ -26,8 +27,8 @@ _FOLDERS = ("image", "images", "rgb")
 def find(source: Path) -> Path | None:
     """The npz file: the given one, or that in the folder."""
     if source.is_file():
-        return source if source.suffix == ".npz" else None
-    named = [source / name for name in _NAMES if (source / name).is_file()]
+        return source if source.suffix.lower() == ".npz" else None
+    named = [path for path in (entry_of(source, name) for name in _NAMES) if path.is_file()]
     return next(iter(named or sorted(source.glob("cameras*.npz"))), None)
 
 
@@ -40,7 +41,8 @@ def read(source: Path, images: Path | None = None) -> Capture:
     path = find(source)
     assert path is not None, "``find`` knows the source"
     root = source if source.is_dir() else source.parent
-    folder = images or next((root / name for name in _FOLDERS if (root / name).is_dir()), None)
+    named = (entry_of(root, name) for name in _FOLDERS)
+    folder = images or next((path for path in named if path.is_dir()), None)
     if folder is None:
         raise UserError(f"'{path}' has no folder 'image' beside it; name it with --images.")
     files = images_in(folder)

@@ -14,14 +14,16 @@ import numpy as np
 from ...errors import UserError
 from ..camera import Camera
 from ..decoding import image_size, images_in
+from ..file_names import entry_of
 from ..frames import Capture, Frame, camera_for_image, pose_of
 
 
 def find(source: Path) -> Path | None:
     """The npy file: the given one, or that in the folder."""
     if source.is_file():
-        return source if source.suffix == ".npy" else None
-    return source / "poses_bounds.npy" if (source / "poses_bounds.npy").is_file() else None
+        return source if source.suffix.lower() == ".npy" else None
+    named = entry_of(source, "poses_bounds.npy")
+    return named if named.is_file() else None
 
 
 def read(source: Path, images: Path | None = None) -> Capture:
@@ -35,7 +37,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
     """
     path = find(source)
     assert path is not None, "``find`` knows the source"
-    folder = images or path.parent / "images"
+    folder = images or entry_of(path.parent, "images")
     if not folder.is_dir():
         raise UserError(f"'{path}' has no folder 'images' beside it; name it with --images.")
     try:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, overload
 
@@ -16,7 +17,7 @@ from ...errors import UserError
 from ...json_files import read_json
 from ..camera import Camera, Distortion
 from ..decoding import image_size
-from ..file_names import Copies, existing
+from ..file_names import Copies, entry_of, existing
 from ..frames import Capture, Frame, camera_for_image, pose_of
 
 _MODELS = ("", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -30,8 +31,8 @@ _Z_UP = np.array([0.0, 0.0, 1.0])
 def find(source: Path) -> Path | None:
     """The folder or file, if it is such a capture."""
     if source.is_file():
-        return source if source.suffix == ".json" else None
-    return source if any(source.glob("transforms*.json")) else None
+        return source if source.suffix.lower() == ".json" else None
+    return source if _transforms(source) else None
 
 
 def read(source: Path, images: Path | None = None, *, opencv_axes: bool = False) -> Capture:
@@ -59,16 +60,20 @@ def read(source: Path, images: Path | None = None, *, opencv_axes: bool = False)
     return Capture("NeRF transforms.json", source, tuple(frames), up=_Z_UP, has_opengl_axes=True)
 
 
+def _transforms(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("*") if fnmatch(path.name.casefold(), "transforms*.json"))
+
+
 def _files(source: Path) -> list[tuple[Path, bool]]:
     if source.is_file():
         return [(source, False)]
-    train = source / "transforms_train.json"
+    train, plain = entry_of(source, "transforms_train.json"), entry_of(source, "transforms.json")
     if train.is_file():
-        held_out = [source / f"transforms_{split}.json" for split in ("test", "val")]
+        held_out = [entry_of(source, f"transforms_{split}.json") for split in ("test", "val")]
         return [(train, False), *[(path, True) for path in held_out if path.is_file()][:1]]
-    if (source / "transforms.json").is_file():
-        return [(source / "transforms.json", False)]
-    found = sorted(source.glob("transforms*.json"))
+    if plain.is_file():
+        return [(plain, False)]
+    found = _transforms(source)
     if len(found) != 1:
         names = ", ".join(path.name for path in found)
         raise UserError(f"'{source}' has {names}, and neither transforms.json nor transforms_train.json; "
