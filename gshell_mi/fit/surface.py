@@ -10,9 +10,12 @@ import numpy as np
 from ..fields import LatticeFields
 from ..lattice import GRIDS, BlockLattice, Lattice
 
-#: Reflectances that the first split of radiance into material and light assumes: the median one, and what
-#: that of the brightest parts does not exceed. White paint reflects as much.
-TYPICAL_REFLECTANCE, _WHITE = 0.5, 0.8
+#: Median reflectance that the first split of radiance into material and light assumes.
+TYPICAL_REFLECTANCE = 0.5
+
+#: Radiance, over that of the even light, that something may have: white paint reflects 0.8, and what faces the
+#: sun or a window gets some 2.5 times the light that all of an object gets in the mean.
+_WHITE = 0.8 * 2.5
 
 #: Share of a surface that is not brighter than its brightest parts.
 _BRIGHTEST = 0.98
@@ -42,8 +45,9 @@ class Seen:
     def even_light(radiance: np.ndarray) -> np.float32:
         """Brightness of the darkest even light that explains radiance, (V, 3), as of what is of a usual kind.
 
-        Were it as dark as the median alone tells, what is white on something black could not be explained: no
-        reflectance exceeds 1. Where nothing is seen it is 1.
+        Were it as dark as the median alone tells, white seams of something black could not be explained: no
+        reflectance exceeds 1, and few bright places do not make the light brighter. Where nothing is seen it
+        is 1.
         """
         if not len(radiance):
             return np.float32(1)
