@@ -13,8 +13,8 @@ from ..lattice import GRIDS, BlockLattice, Lattice
 #: Median reflectance that the first split of radiance into material and light assumes.
 TYPICAL_REFLECTANCE = 0.5
 
-#: Radiance, over that of the even light, that something may have: white paint reflects 0.8, and what faces the
-#: sun or a window gets some 2.5 times the light that all of an object gets in the mean.
+#: Radiance, over that of the even light, that something may have: white paint reflects 0.8, and what faces
+#: the sun or a window gets some 2.5 times the light that all of an object gets in the mean.
 _WHITE = 0.8 * 2.5
 
 #: Share of a surface that is not brighter than its brightest parts.
