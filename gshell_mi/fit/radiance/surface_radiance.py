@@ -167,6 +167,10 @@ class SurfaceRadiance:
         sample = self.pixels.sample(self.config.batch, seed=self.seed, step=step)
         return sample, self._sheets(self.views.rays(sample.view, sample.film))
 
+    def see(self, ray: mi.Ray3f) -> tuple[mi.Color3f, mi.Float]:
+        """Radiance and coverage along rays."""
+        return self.composite(self._sheets(ray), dr.width(ray.d))
+
     def update(self, names: tuple[str, ...], rate: float) -> None:
         """Steps the parameters ``names``; the others rest.
 
