@@ -38,8 +38,7 @@ def entry_of(folder: Path, name: str) -> Path:
     for part in PurePosixPath(name).parts:
         path = folder / part
         if not path.exists() and folder.is_dir():
-            path = next((other for other in sorted(folder.iterdir())
-                         if other.name.casefold() == part.casefold()), path)
+            path = folder / _by_case(str(folder), folder.stat().st_mtime_ns).get(part.casefold(), part)
         folder = path
     return folder
 
@@ -58,6 +57,12 @@ def _existing_folder(named: Path) -> Path | None:
 def _by_spelling(folder: str, changed: int) -> dict[str, str]:
     names = sorted(file.name for file in Path(folder).iterdir() if file.is_file())
     return {_spelling(name): name for name in reversed(names)}
+
+
+@lru_cache(maxsize=16)
+def _by_case(folder: str, changed: int) -> dict[str, str]:
+    names = sorted(path.name for path in Path(folder).iterdir())
+    return {name.casefold(): name for name in reversed(names)}
 
 
 def _spelling(name: str) -> str:

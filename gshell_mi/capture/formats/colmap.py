@@ -55,8 +55,9 @@ def _suffix(folder: Path) -> str | None:
 
 def _image_count(model: Path) -> int:
     """Roughly, as the model may be malformed."""
-    file = entry_of(model, f"images{_suffix(model)}")
-    if _suffix(model) == ".bin":
+    suffix = _suffix(model)
+    file = entry_of(model, f"images{suffix}")
+    if suffix == ".bin":
         with open(file, "rb") as stream:
             return int.from_bytes(stream.read(8), "little")
     with open(file, encoding="utf-8", errors="replace") as stream:
@@ -81,8 +82,9 @@ def read(source: Path, images: Path | None = None) -> Capture:
     others = [path for path in _models(model.parent) if path != model] if model != source else []
     notes = [f"'{model.parent}' has {len(others) + 1} models; '{model.name}' is taken, as it has the most "
              f"images: merge them in COLMAP (model_merger) for the others."] if others else []
-    cameras_file, images_file = (entry_of(model, f"{name}{_suffix(model)}") for name in ("cameras", "images"))
-    if _suffix(model) == ".bin":
+    suffix = _suffix(model)
+    cameras_file, images_file = (entry_of(model, f"{name}{suffix}") for name in ("cameras", "images"))
+    if suffix == ".bin":
         cameras, poses = _read_cameras_bin(cameras_file), _read_images_bin(images_file)
     else:
         cameras, poses = _read_cameras_txt(cameras_file), _read_images_txt(images_file)
@@ -108,8 +110,8 @@ def _image(folder: Path, name: str) -> Path:
 
 def _image_folder(source: Path, model: Path) -> Path:
     for parent in (source, *model.resolve().parents[:3]):
-        if entry_of(parent, "images").is_dir():
-            return entry_of(parent, "images")
+        if (folder := entry_of(parent, "images")).is_dir():
+            return folder
     raise UserError(f"The COLMAP model in '{model}' has no folder 'images' near it; name it with --images.")
 
 

@@ -17,12 +17,12 @@ _STEPS = 6
 #: with the camera.
 _GLOSSY = 3
 
-#: Angles between views, in degrees, over which a look may change, and shares of a gain's variance that it may
-#: be. Views of a capture are rarely nearer to each other than the least angle.
-_ANGLES, _SHARES = (20.0, 30.0, 45.0, 60.0, 90.0), np.linspace(0.0, 0.98, 50)
-
 #: Standard deviation of their coefficients before anything was seen.
 _FREE = 1.0
+
+#: Angles between views, in degrees, over which a look may change, and shares of a gain's variance that it may
+#: be. Views of a capture are rarely nearer to each other than the least angle.
+_ANGLES, _SHARES = (20.0, 30.0, 45.0, 60.0, 90.0), np.linspace(0.02, 0.98, 49)
 
 #: Variance of the gains, as a multiple of that of their noise, above which they count.
 _CLEAR = 2.0
@@ -177,21 +177,24 @@ def _without_look(gains: np.ndarray, toward: np.ndarray) -> tuple[np.ndarray, bo
 
     Angle and share are the likeliest ones, if they are worth two parameters (Schwarz 1978).
     """
-    count, channels = gains.size, gains.shape[1]
-    if not count:
+    if not gains.size:
         return gains, False
+
+    def likelihood(parts: np.ndarray, variance: np.ndarray) -> float:
+        """Twice its logarithm, but for a constant, with the scale of the (N, 1) variances that suits best."""
+        volume = gains.shape[1] * np.log(variance).sum()
+        return -gains.size * np.log((parts**2 / variance).mean() + _EXACT**2) - volume
+
     gains = gains - gains.mean(axis=0)
-    likeliest, found = -count * np.log((gains**2).mean() + _EXACT**2) + 2 * np.log(count), None
+    likeliest, found = likelihood(gains, np.ones((len(gains), 1))) + 2 * np.log(gains.size), None
     for angle in _ANGLES:
         alike = np.exp((toward @ toward.T - 1) / np.radians(angle) ** 2)
         size, basis = np.linalg.eigh(alike)
         parts = basis.T @ gains
-        for share in _SHARES[1:]:
+        for share in _SHARES:
             variance = (share * np.maximum(size, 0) + 1 - share)[:, None]
-            volume = channels * np.log(variance).sum()
-            likelihood = -count * np.log((parts**2 / variance).mean() + _EXACT**2) - volume
-            if likelihood > likeliest:
-                likeliest, found = likelihood, basis @ ((1 - share) * parts / variance)
+            if (value := likelihood(parts, variance)) > likeliest:
+                likeliest, found = value, basis @ ((1 - share) * parts / variance)
     return (gains, False) if found is None else (found, True)
 
 
