@@ -1,6 +1,7 @@
 """Every test runs on one Mitsuba variant, chosen with ``--variant`` (default ``llvm_ad_rgb``)."""
 
 import os
+import re
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,7 +13,9 @@ import pytest
 
 # Modules that cannot be imported without the extra "generate": their own tests say that they are skipped.
 collect_ignore = [] if find_spec("torch") and find_spec("monai") else [
-    "gshell_mi/generation/models", "gshell_mi/generation/sampling.py", "gshell_mi/generation/training.py"]
+    "gshell_mi/generation/models",
+    *(str(path) for path in Path(__file__).parent.glob("gshell_mi/generation/*.py")
+      if re.search(r"^(from|import) (torch|monai)\b", path.read_text(encoding="utf-8"), re.MULTILINE))]
 
 
 def pytest_addoption(parser):
