@@ -3,8 +3,8 @@
 They are first sought on a hull, before anything is known of exposures, cameras and hollows. Where much of
 that is wrong, what is seen through a true opening is explained no better than by its cap, and a false one
 may be right behind the surface. So the same radiance with opacity, and the same judge, are asked once more.
-What is open and explains unseen views worse than its cap closes; what is proposed and explains them better
-opens; what nobody tells of stays as it is.
+An opening that explains unseen views no better than a cap does closes; what is proposed and explains them
+better opens; what nobody tells of stays as it is.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
+from ...extraction.surface_mesh import SurfaceMesh
 from ...fields.smoothing import MeshDiffusion
+from ...template.caps import least_bent, put_in_place
 from ...template.msdf import clean_opacity, reopened, rewritten
 from ...template.sides import opposite_sides
 from ...topology import lobes
@@ -27,6 +29,9 @@ from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface
 from .openings import OpacityTraining, OpeningsConfig, justified
+
+#: Size of the mSDF of what has closed, at least, in cells.
+_SURE = 0.5
 
 #: Lambda that smooths new rims along the template.
 _SMOOTHING = 3.0
@@ -43,10 +48,10 @@ class Revision:
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface with other openings, if there are any."""
         lattice, count = surface.lattice, self.config.iterations
-        template = fit.scene.subject.surface_of(surface.fields, template=True)
+        with steps.task("closing"):
+            closed = _closed(fit, surface)
+        template, values = _template(fit, closed)
         vertices, faces, _ = template.to_numpy()
-        msdf = mi.Float(surface.fields.msdf)
-        values = template.interpolate(msdf).numpy() / lattice.spacing
         mirrored = fit.judge.shown(positive_part(vertices, faces, values)).mirrored
         appearance = SurfaceRadiance(vertices, faces, fit.views, fit.pixels, fit.config.radiance,
                                      seed=fit.config.seed, mirrored=mirrored)
@@ -54,46 +59,76 @@ class Revision:
         mesh = vertices, faces
         with steps.task("verdict"):
             proposed = appearance.smoothed_logits()
-            thickness, opposite = opposite_sides(vertices, vertices, faces, fit.cell(surface))
-            thin = np.isfinite(thickness)
-            revised = _closed(fit, mesh, values, proposed, np.where(thin, opposite, -1))
-            revised = _opened(fit, mesh, revised, proposed, thin)
+            thickness, _ = opposite_sides(vertices, vertices, faces, fit.cell(surface))
+            revised = _with_islands(fit, mesh, values, proposed)
+            revised = _opened(fit, mesh, revised, proposed, np.isfinite(thickness))
             revised = clean_opacity(revised, *mesh, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
-        steps.fact("openings_changed", bool(changed.any()))
+        steps.fact("openings_changed", bool(changed.any()) or closed is not surface)
         if not changed.any():
-            return surface
+            return closed
         smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
         cut, near = reopened(lattice.spacing * values, revised <= 0, smooth, lattice.spacing)
-        msdf = rewritten(msdf, cut, near, template, lattice)
-        return replace(surface.with_fields(msdf=msdf.numpy()), settled=False)
+        msdf = rewritten(mi.Float(closed.fields.msdf), cut, near, template, lattice)
+        return replace(closed.with_fields(msdf=msdf.numpy()), settled=False)
 
 
-def _closed(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.ndarray,
-            opposite: np.ndarray) -> np.ndarray:
-    """(V,) values, those of openings negated that unseen views explain better as surface.
+def _template(fit: Fit, surface: Surface) -> tuple[SurfaceMesh, np.ndarray]:
+    """The watertight template of a surface, and (V,) its mSDF there in cells."""
+    template = fit.scene.subject.surface_of(surface.fields, template=True)
+    return template, template.interpolate(mi.Float(surface.fields.msdf)).numpy() / surface.lattice.spacing
 
-    First what the radiance shows to be opaque in them, such as islands; then all of an opening. Through one
-    opening others are seen, so the worst close first. Where a sheet has one side, what closes the other one
-    is a cell from it, and looks alike.
 
-    Args:
-        fit, template, values, proposed: as of ``_opened``.
-        opposite: (V,) vertex on the template's other side, -1 if that is not near.
+def _closed(fit: Fit, surface: Surface) -> Surface:
+    """The surface without the openings that explain unseen views no better than smooth caps.
+
+    Nothing has shaped the caps so far, and a hull's bulge explains too little to stand for a surface. Through
+    one opening others are seen, so the worst close first. Where a sheet has one side, what closes the other
+    one is a cell from it, and looks alike.
     """
-    for closing in (proposed > 0, np.ones_like(values, bool)):
-        while (chosen := (values <= 0) & closing).any():
-            place = places_of(chosen, lobes(chosen, template[1]))
-            now = fit.judge.shown(positive_part(*template, values))
-            closed = np.where(chosen, np.abs(values), values)
-            after = fit.judge.shown(positive_part(*template, closed), like=now)
-            verdict = fit.judge.compare(now, after, (template, place))
-            backed = (opposite >= 0) & (values[opposite] > 0)
-            alone = 2 * np.bincount(place[chosen], backed[chosen]) <= np.bincount(place[chosen])
-            gain = np.where(verdict.accepted & alone, verdict.gain, 0)
-            if not gain.any():
-                break
-            values = np.where(chosen & (gain >= WORST * gain.max())[place], -values, values)
+    template, values = _template(fit, surface)
+    vertices, faces, _ = template.to_numpy()
+    thickness, opposite = opposite_sides(vertices, vertices, faces, fit.cell(surface))
+    thin, opened = np.isfinite(thickness), values <= 0
+    smooth, positions = least_bent(vertices, faces, opened & ~thin), vertices
+    while (chosen := values <= 0).any():
+        place = places_of(chosen, lobes(chosen, faces))
+        now = fit.judge.shown(positive_part(positions, faces, values))
+        capped = fit.judge.shown((smooth, faces), like=now)
+        verdict = fit.judge.compare(now, capped, ((vertices, faces), place))
+        backed = thin & (values[opposite] > 0)
+        alone = 2 * np.bincount(place[chosen], backed[chosen]) <= np.bincount(place[chosen])
+        gain = np.where(np.isfinite(verdict.noise) & alone, verdict.gain, 0)
+        if gain.max() <= 0:
+            break
+        values = np.where(chosen & (gain >= WORST * gain.max())[place], -values, values)
+        positions = np.where((opened & (values > 0))[:, None], smooth, vertices)
+    closed = opened & (values > 0)
+    if not closed.any():
+        return surface
+    lattice, fields = surface.lattice, surface.fields
+    points = mi.Transform4f(fit.scene.subject.to_world) @ mi.Point3f(lattice.points(mi.Float))
+    sdf, told = put_in_place(fields.sdf / lattice.spacing, points.numpy().T, positions, faces, closed,
+                             fit.cell(surface))
+    msdf = rewritten(mi.Float(fields.msdf), lattice.spacing * values, closed, template, lattice).numpy()
+    msdf = np.where(told, np.maximum(np.abs(msdf), _SURE * lattice.spacing), msdf)
+    closed = surface.with_fields(sdf=(lattice.spacing * sdf).astype(np.float32), msdf=msdf.astype(np.float32))
+    return replace(closed, settled=False)
+
+
+def _with_islands(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.ndarray) -> np.ndarray:
+    """(V,) values, those in openings negated where the radiance shows something opaque that explains unseen
+    views better, such as an island."""
+    while (chosen := (values <= 0) & (proposed > 0)).any():
+        place = places_of(chosen, lobes(chosen, template[1]))
+        now = fit.judge.shown(positive_part(*template, values))
+        solid = np.where(chosen, np.abs(values), values)
+        after = fit.judge.shown(positive_part(*template, solid), like=now)
+        verdict = fit.judge.compare(now, after, (template, place))
+        gain = np.where(verdict.accepted, verdict.gain, 0)
+        if not gain.any():
+            break
+        values = np.where(chosen & (gain >= WORST * gain.max())[place], -values, values)
     return values
 
 

@@ -1,0 +1,71 @@
+"""Caps of openings that go on as smoothly as the surface around them.
+
+Nobody sees a cap, so nothing has shaped it: it is where the hull was, which may bulge from a surface that the
+images have moved since. What would close the opening is better told by its surroundings.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from scipy.sparse import coo_matrix, diags, eye
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
+
+from ..conversion.mesh_distance import MeshFeet
+from ..topology import mesh_edges
+
+#: What holds a cap without surroundings in place, as a share of what bends it.
+_HELD = 1e-6
+
+#: Cells around a cap in which a signed distance is that to it; beyond, where the side is another now.
+_BAND = 2.0
+
+#: Faces whose centres are nearest to a point, of which one is the nearest.
+_CANDIDATES = 8
+
+
+def least_bent(vertices: np.ndarray, faces: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """(V, 3) vertices of a mesh, the ``free`` (V,) ones where it bends the least: a discrete thin plate
+    (Kobbelt and others 1998) that goes on as the rest of the mesh does."""
+    chosen, moved = np.flatnonzero(free), np.array(vertices, np.float64)
+    if not len(chosen):
+        return moved
+    start, end = mesh_edges(faces)[0].T
+    adjacency = coo_matrix((np.ones(len(start)), (start, end)), shape=(len(vertices),) * 2)
+    adjacency = (adjacency + adjacency.T).tocsr()
+    degree = np.maximum(np.asarray(adjacency.sum(axis=1)).ravel(), 1)
+    bending = eye(len(vertices)) - diags(1 / degree) @ adjacency
+    energy = (bending.T @ bending).tocsc()[:, chosen]
+    system = energy[chosen] + _HELD * eye(len(chosen))
+    moved[chosen] -= spsolve(system.tocsc(), energy.T @ moved)
+    return moved
+
+
+def put_in_place(sdf: np.ndarray, points: np.ndarray, moved: np.ndarray, faces: np.ndarray,
+                 caps: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
+    """A signed distance whose surface passes through caps that have moved, and is the same elsewhere.
+
+    Args:
+        sdf: (n,) in cells, at a lattice's vertices.
+        points: (n, 3) where these are.
+        moved: (V, 3) of the template, in the unit of the points, its caps where they come to be.
+        faces: (F, 3), oriented outwards.
+        caps: (V,) which vertices have moved.
+        cell: side of a lattice cell, in the same unit.
+
+    Returns:
+        (n,) values in cells, and which of them are those of caps.
+    """
+    covered = caps[faces].any(axis=1)
+    mesh = trimesh.Trimesh(moved, faces, process=False)
+    reach = _BAND * cell
+    low, high = (bound(moved[caps], axis=0) for bound in (np.min, np.max))
+    near = np.flatnonzero(((points > low - reach) & (points < high + reach)).all(axis=1))
+    face = cKDTree(mesh.triangles_center).query(points[near], min(_CANDIDATES, len(faces)))[1]
+    feet = MeshFeet(mesh)(points[near], face)
+    told = covered[feet.face] & ((feet.distance < reach) | ((sdf[near] < 0) == (feet.height > 0)))
+    smooth, chosen = np.array(sdf), np.zeros(len(sdf), bool)
+    smooth[near[told]] = (np.copysign(feet.distance, feet.height) / cell)[told]
+    chosen[near[told]] = True
+    return smooth, chosen
