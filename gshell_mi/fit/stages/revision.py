@@ -14,7 +14,6 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
-from ...extraction.surface_mesh import SurfaceMesh
 from ...fields.smoothing import MeshDiffusion
 from ...template.caps import least_bent, put_in_place
 from ...template.msdf import clean_opacity, reopened, rewritten
@@ -47,55 +46,62 @@ class Revision:
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface with other openings, if there are any."""
-        lattice, count = surface.lattice, self.config.iterations
-        with steps.task("closing"):
-            closed = _closed(fit, surface)
-        template, values = _template(fit, closed)
+        lattice, fields, cell = surface.lattice, surface.fields, fit.cell(surface)
+        template = fit.scene.subject.surface_of(fields, template=True)
         vertices, faces, _ = template.to_numpy()
+        values = template.interpolate(mi.Float(fields.msdf)).numpy() / lattice.spacing
         mirrored = fit.judge.shown(positive_part(vertices, faces, values)).mirrored
         appearance = SurfaceRadiance(vertices, faces, fit.views, fit.pixels, fit.config.radiance,
                                      seed=fit.config.seed, mirrored=mirrored)
-        steps.run(OpacityTraining(appearance, self.config), count, {"radiance": appearance.optimizer})
-        mesh = vertices, faces
+        steps.run(OpacityTraining(appearance, self.config), self.config.iterations,
+                  {"radiance": appearance.optimizer})
         with steps.task("verdict"):
             proposed = appearance.smoothed_logits()
-            thickness, _ = opposite_sides(vertices, vertices, faces, fit.cell(surface))
-            revised = _with_islands(fit, mesh, values, proposed)
-            revised = _opened(fit, mesh, revised, proposed, np.isfinite(thickness))
-            revised = clean_opacity(revised, *mesh, fit.config.topology.min_area)
+            thickness, opposite = opposite_sides(vertices, vertices, faces, cell)
+            thin = np.isfinite(thickness)
+            revised = _with_islands(fit, (vertices, faces), values, proposed)
+            revised, capped, moved = _closed(fit, (vertices, faces), revised, np.where(thin, opposite, -1))
+            revised = _opened(fit, (moved, faces), revised, proposed, thin)
+            revised = clean_opacity(revised, moved, faces, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
-        steps.fact("openings_changed", bool(changed.any()) or closed is not surface)
+        steps.fact("openings_changed", bool(changed.any()))
         if not changed.any():
-            return closed
+            return surface
         smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
         cut, near = reopened(lattice.spacing * values, revised <= 0, smooth, lattice.spacing)
-        msdf = rewritten(mi.Float(closed.fields.msdf), cut, near, template, lattice)
-        return replace(closed.with_fields(msdf=msdf.numpy()), settled=False)
+        msdf = rewritten(mi.Float(fields.msdf), cut, near, template, lattice).numpy()
+        capped &= revised > 0
+        if not capped.any():
+            return replace(surface.with_fields(msdf=msdf), settled=False)
+        points = mi.Transform4f(fit.scene.subject.to_world) @ mi.Point3f(lattice.points(mi.Float))
+        sdf, told = put_in_place(fields.sdf / lattice.spacing, points.numpy().T, moved, faces, capped, cell)
+        sdf = (lattice.spacing * sdf).astype(np.float32)
+        msdf = np.where(told, np.maximum(np.abs(msdf), _SURE * lattice.spacing), msdf).astype(np.float32)
+        return replace(surface.with_fields(sdf=sdf, msdf=msdf), settled=False)
 
 
-def _template(fit: Fit, surface: Surface) -> tuple[SurfaceMesh, np.ndarray]:
-    """The watertight template of a surface, and (V,) its mSDF there in cells."""
-    template = fit.scene.subject.surface_of(surface.fields, template=True)
-    return template, template.interpolate(mi.Float(surface.fields.msdf)).numpy() / surface.lattice.spacing
-
-
-def _closed(fit: Fit, surface: Surface) -> Surface:
-    """The surface without the openings that explain unseen views no better than smooth caps.
+def _closed(fit: Fit, template: Mesh, values: np.ndarray,
+            opposite: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Closes openings that explain unseen views no better than caps that go on as their surroundings do.
 
     Nothing has shaped the caps so far, and a hull's bulge explains too little to stand for a surface. Through
     one opening others are seen, so the worst close first. Where a sheet has one side, what closes the other
     one is a cell from it, and looks alike.
+
+    Args:
+        fit, template, values: as of ``_opened``.
+        opposite: (V,) vertex on the template's other side, -1 if that is not near.
+
+    Returns:
+        (V,) values, those of closed openings negated; (V,) which are; and (V, 3) where the vertices are then.
     """
-    template, values = _template(fit, surface)
-    vertices, faces, _ = template.to_numpy()
-    thickness, opposite = opposite_sides(vertices, vertices, faces, fit.cell(surface))
-    thin, opened = np.isfinite(thickness), values <= 0
+    (vertices, faces), thin, opened = template, opposite >= 0, values <= 0
     smooth, positions = least_bent(vertices, faces, opened & ~thin), vertices
     while (chosen := values <= 0).any():
         place = places_of(chosen, lobes(chosen, faces))
         now = fit.judge.shown(positive_part(positions, faces, values))
-        capped = fit.judge.shown((smooth, faces), like=now)
-        verdict = fit.judge.compare(now, capped, ((vertices, faces), place))
+        whole = fit.judge.shown((smooth, faces), like=now)
+        verdict = fit.judge.compare(now, whole, (template, place))
         backed = thin & (values[opposite] > 0)
         alone = 2 * np.bincount(place[chosen], backed[chosen]) <= np.bincount(place[chosen])
         gain = np.where(np.isfinite(verdict.noise) & alone, verdict.gain, 0)
@@ -103,17 +109,7 @@ def _closed(fit: Fit, surface: Surface) -> Surface:
             break
         values = np.where(chosen & (gain >= WORST * gain.max())[place], -values, values)
         positions = np.where((opened & (values > 0))[:, None], smooth, vertices)
-    closed = opened & (values > 0)
-    if not closed.any():
-        return surface
-    lattice, fields = surface.lattice, surface.fields
-    points = mi.Transform4f(fit.scene.subject.to_world) @ mi.Point3f(lattice.points(mi.Float))
-    sdf, told = put_in_place(fields.sdf / lattice.spacing, points.numpy().T, positions, faces, closed,
-                             fit.cell(surface))
-    msdf = rewritten(mi.Float(fields.msdf), lattice.spacing * values, closed, template, lattice).numpy()
-    msdf = np.where(told, np.maximum(np.abs(msdf), _SURE * lattice.spacing), msdf)
-    closed = surface.with_fields(sdf=(lattice.spacing * sdf).astype(np.float32), msdf=msdf.astype(np.float32))
-    return replace(closed, settled=False)
+    return values, opened & (values > 0), positions
 
 
 def _with_islands(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.ndarray) -> np.ndarray:

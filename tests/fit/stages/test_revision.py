@@ -72,3 +72,23 @@ def test_what_is_right_stays(fit, opened):
     again, _ = revised(fit, before)
     assert loops(fit, again).boundary_loops == 1
     assert loops(fit, again).boundary_length == pytest.approx(loops(fit, before).boundary_length, rel=0.05)
+
+
+def test_a_bulge_that_is_open_closes_without_it(fit, opened):
+    """Its cap, where it is, explains the images no better than the hole; what goes on around it does."""
+    before, _ = opened
+    lattice = before.lattice
+    points = lattice.points(mi.Float).numpy().T
+    lowest = vertices_of(fit, before)[:, 1].min()
+    bulge = np.linalg.norm(points - [0, lowest, 0], axis=1) - 2.2 * lattice.spacing
+    torn = cut(fit, before, lambda points: (bulge < 0.5 * lattice.spacing) & (points[:, 1] < -0.3))
+    torn = torn.with_fields(sdf=np.minimum(torn.fields.sdf, bulge).astype(np.float32))
+    assert loops(fit, torn).boundary_loops == 2
+    mended, _ = revised(fit, torn)
+    assert loops(fit, mended).boundary_loops == 1
+    assert vertices_of(fit, mended)[:, 1].min() == pytest.approx(lowest, abs=lattice.spacing)
+
+
+def vertices_of(fit, surface):
+    """(V, 3) vertices of the surface."""
+    return fit.scene.subject.surface_of(surface.fields).to_numpy()[0]
