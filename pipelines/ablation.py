@@ -1,11 +1,12 @@
-"""Switches single ideas and losses of the fit off, or on, and writes what each is worth as a page.
+"""Switches single stages of the fit off and writes what each is worth as a page.
 
-    python pipelines/ablation.py [SCENE.xml ...] [--rows NAME ...] [--set resolution=48 iterations=100]
+    python pipelines/ablation.py [SCENE.xml ...] [--rows NAME ...] [--set resolution=48]
 
-A row fits every scene with the settings of the first row but for those of one idea. Fits run one after
-another; a fit whose scores exist under the same settings is not made again, and one that was interrupted
-goes on, so stop and start the command as you like. The mesh is scored against the scene's ``truth.ply``, and
-renderings from the sensors of its ``test.xml``, which no fit sees, against those of its ``reference.xml``.
+A row fits every scene with the settings of the first row but for those of one stage, or of one idea or loss
+if ``--rows`` names such. Fits run one after another; a fit whose scores exist under the same settings is not
+made again, and one that was interrupted goes on, so stop and start the command as you like. The mesh is
+scored against the scene's ``truth.ply``, and renderings from the sensors of its ``test.xml``, which no fit
+sees, against those of its ``reference.xml``.
 After code has changed, start with an empty ``--output``.
 """
 
@@ -18,7 +19,7 @@ from pathlib import Path
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(REPOSITORY / "pipelines"), str(REPOSITORY)]
 
-from fit_study.ablation_rows import ROWS  # noqa: E402
+from fit_study.ablation_rows import ROWS, STAGES  # noqa: E402
 from fit_study.command import add_common_arguments, run_study  # noqa: E402
 from fit_study.settings import as_flags, non_default  # noqa: E402
 from fit_study.tables import LEGEND, table  # noqa: E402
@@ -26,14 +27,18 @@ from fit_study.trials import Trial, load_outcome  # noqa: E402
 
 from gshell_mi.fit import FitConfig  # noqa: E402
 
-SCENES = [REPOSITORY / "scenes" / f"{name}.xml" for name in ("tshirt", "vase")]
-NOTES = Path(__file__).with_name("ablation_notes.md")
+SCENES = [REPOSITORY / "scenes" / f"{name}.xml" for name in ("tshirt", "chair")]
+NOTES = Path(__file__).with_name("stages_notes.md")
 
 _INTRODUCTION = """\
-# Ablation
+# What each stage is worth
 
-Made by `python pipelines/ablation.py{options}`. Every row is the first one with the settings of a single idea
-changed, those named in it. {shared} The default's other seeds tell which differences mean nothing.
+[fit.md](fit.md) tells how a fit works. Here are fits without one of its stages each, made by
+
+    python pipelines/ablation.py{options}
+
+on the scenes of this repository; all else is the same. {shared} `--rows` compares single choices within the
+stages, too, and losses; `--list` names them.
 
 {legend}
 
@@ -48,13 +53,10 @@ def page(scenes: list[Path], base: FitConfig, output: Path, options: str) -> str
     if NOTES.exists():
         text += NOTES.read_text() + "\n"
     for scene in scenes:
-        outcomes = [load_outcome(Trial(scene, row.name, row.config(base)), output) for row in ROWS]
-        rows = [(row.group, f"{row.says} `{as_flags(row.changes)}`" if row.changes else row.says, outcome)
-                for row, outcome in zip(ROWS, outcomes, strict=True)]
-        text += f"## {scene.stem}\n\n{table(rows, 'what is changed')}\n"
-        missing = [row.says for row, outcome in zip(ROWS, outcomes, strict=True) if outcome is None]
-        if missing:
-            text += f"Not measured: {'; '.join(missing)}.\n\n"
+        rows = [(row.group, f"{row.says} `{as_flags(row.changes)}`" if row.changes else row.says,
+                 load_outcome(Trial(scene, row.name, row.config(base)), output)) for row in ROWS]
+        if any(outcome for *_, outcome in rows):
+            text += f"## {scene.stem}\n\n{table(rows, 'what is left out')}\n"
     return text.rstrip() + "\n"
 
 
@@ -62,9 +64,10 @@ def main(given: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     names = [row.name for row in ROWS]
-    add_common_arguments(parser, SCENES, "out/ablation", REPOSITORY / "docs" / "ablation.md")
-    parser.add_argument("--rows", nargs="+", choices=names, default=names, metavar="NAME",
-                        help="only these rows; --list shows what there is")
+    add_common_arguments(parser, SCENES, "out/ablation", REPOSITORY / "docs" / "stages.md")
+    parser.add_argument("--rows", nargs="+", choices=names, metavar="NAME",
+                        default=[row.name for row in STAGES],
+                        help="these rows, default: the stages; --list shows what there is")
     parser.add_argument("--list", action="store_true", help="list the rows and stop")
     arguments = parser.parse_args(given)
     if arguments.list:

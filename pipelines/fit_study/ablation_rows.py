@@ -1,4 +1,4 @@
-"""The rows of the ablation: each changes the settings of one idea."""
+"""The rows of the ablation: each switches off one stage, or changes the settings of one idea."""
 
 from __future__ import annotations
 
@@ -29,9 +29,29 @@ def _group(title: str, *rows: tuple[str, str, dict]) -> list[Row]:
     return [Row(title, name, says, changes) for name, says, changes in rows]
 
 
-ROWS = [
-    *_group("Default",
-            ("default", "everything on", {}),
+#: The stages of a fit in their order, each without the others being changed.
+STAGES = _group(
+    "Without one of the stages",
+    ("default", "all stages", {}),
+    ("no-openings", "*openings*, and *revision*: where the hull is open in truth", {"watertight": True}),
+    ("no-cavities", "*cavities*: folds and hollows that the hull bridges", {"cavities.iterations": 0}),
+    ("no-refinement", "*refinement*, and *folds*: whole parts move to where the images agree",
+     {"refinement.iterations": 0}),
+    ("no-folds", "*folds*: the same for details", {"folds.iterations": 0}),
+    ("no-volume", "*volume*: another start, for gaps and struts that no hull shows",
+     {"volume.iterations": 0}),
+    ("no-joint", "*joint*, and what follows: shape, material and light by light transport",
+     {"iterations": 0}),
+    ("no-poses", "*poses*: cameras corrected", {"poses": "keep"}),
+    ("no-revision", "*revision*: openings judged again where the surface has moved",
+     {"openings.revise": False}),
+    ("no-detail", "*detail*: a finer lattice", {"detail.iterations": 0}),
+    ("no-texture", "*texture*: colours as fine as the images", {"texture.rounds": 0}),
+)
+
+#: What single choices within the stages are worth, and losses.
+CHOICES = [
+    *_group("Other random numbers",
             ("seed-1", "another seed", {"seed": 1}),
             ("seed-2", "a third seed", {"seed": 2})),
     *_group("Visual hull",
@@ -44,24 +64,18 @@ ROWS = [
             ("no-openings-chroma", "no tie of the two sides", {"openings.chroma": 0.0}),
             ("no-openings-daylight", "no daylight term", {"openings.daylight": 0.0}),
             ("no-openings-mask", "no mask loss", {"openings.mask": 0.0})),
-    *_group("Carving",
-            ("no-carving", "the hull as it is", {"cavities.iterations": 0})),
     *_group("Photometric refinement",
-            ("no-refinement", "off", {"refinement.iterations": 0}),
-            ("no-folds", "first round only", {"folds.iterations": 0}),
             ("folds-to-the-end", "second round never ends early", {"folds.descent": _ALWAYS}),
             ("no-sheets", "both sides of every sheet stay", {"topology.sheet_thickness": 0.0}),
             ("unseen-stays", "what no view sees stays", {"topology.unseen_area": 1.0}),
             ("no-refinement-outline", "silhouettes not held",
              {"refinement.outline": 0.0, "folds.outline": 0.0})),
     *_group("Radiance volume",
-            ("no-volume", "off", {"volume.iterations": 0}),
             ("volume-coarse", "half as many voxels per side", {"volume.side": 128}),
             ("no-volume-direction", "radiance has no direction", {"volume.direction_lr": 0.0}),
             ("no-volume-mask", "no mask loss", {"volume.mask": 0.0}),
             ("no-volume-distortion", "rays may see a spread", {"volume.distortion": 0.0})),
     *_group("Geometry in the joint stage",
-            ("no-joint", "no joint stage", {"iterations": 0}),
             ("fixed-geometry", "only material and light",
              {"joint.geometry_lr": 0.0, "joint.msdf_lr": 0.0, "joint.deform_lr": 0.0}),
             ("no-sobolev", "no Sobolev gradient", {"joint.geometry_smoothing": 0.0}),
@@ -69,7 +83,6 @@ ROWS = [
             ("coarse-only", "smoothing 8 throughout",
              {"joint.geometry_smoothing": 8.0, "joint.geometry_detail": 8.0}),
             ("no-offsets", "no vertex offsets", {"joint.deform_lr": 0.0}),
-            ("no-revision", "no revision of openings", {"openings.revise": False}),
             ("one-view", "one view per step", {"render.views": 1}),
             ("no-warmup", "no warm-up", {"joint.warmup": 0.0}),
             ("shadow-derivatives", "visibility of shadows differentiated", {"render.reparam_depth": 2}),
@@ -117,3 +130,5 @@ ROWS = [
             ("image-relative-l2", "relative L2", {"losses.image": "relative_l2"}),
             ("image-l1", "L1", {"losses.image": "l1"})),
 ]
+
+ROWS = STAGES + CHOICES

@@ -141,7 +141,7 @@ def test_fits_scores_and_does_neither_twice(scene, tmp_path, capsys, monkeypatch
     page = (tmp_path / "page.md").read_text()
     assert "## bowl" in page and "| mask `--losses.mask 0` |" in page
     assert "`--resolution" not in page and "--iterations 2" in page, "shared settings are named"
-    assert "Not measured: another seed;" in page
+    assert "`--poses keep`" not in page, "only what was measured"
 
     monkeypatch.setattr(trials, "fit_scene", None)
     assert ablation.main(options) == 0
