@@ -79,6 +79,7 @@ class Judge:
                  splits: list[tuple[np.ndarray, np.ndarray]], *, batch: int, seed: int = 0):
         self.views, self.targets, self.splits = views, targets, splits
         self.batch, self.seed = batch, seed
+        self._last: tuple[Shown, np.ndarray | None, list] | None = None
 
     @staticmethod
     def halves(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -105,38 +106,57 @@ class Judge:
             places: a mesh and (V,) which change its vertices tell of, from 0; -1 where of none. A ray judges
                 the change at the vertex that it meets first. Default: all rays judge one change.
         """
-        label, where, corners = np.zeros(1, np.int32), None, None
-        if places:
-            (vertices, faces), label = places
-            where, corners = mesh_scene(vertices, faces), mi.UInt32(faces.astype(np.uint32).ravel())
+        mesh, label = places or (None, np.zeros(1, np.int32))
         count, views = int(label.max()) + 1, len(self.views)
         sums = [dr.zeros(mi.Float, max(count, 1) * views) for _ in range(3)]
         labels, most = mi.Int32(label.astype(np.int32)), dr.opaque(mi.UInt32, views)
         with dr.suspend_grad():
+            known = self._seen_before(before, mesh)
             for split, (_, pixels) in enumerate(self._pools):
                 tone = Contrast(pixels.mean_radiance())
-                # Without masks all of an image is covered: who sees nothing there has explained nothing.
-                coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0) if pixels.has_alpha else 3.0)
                 for step in range(_JUDGED):
                     sample = pixels.sample(self.batch, seed=self.seed, step=step)
-                    ray, place, counts = self._rays(sample), mi.Int32(0), mi.Bool(True)
-                    if where:
-                        hit = where.ray_intersect_preliminary(ray, coherent=False)
-                        dr.eval(hit)
-                        corner = dr.gather(mi.UInt32, corners, 3 * hit.prim_index, hit.is_valid())
-                        place = dr.gather(mi.Int32, labels, corner, hit.is_valid())
-                        counts = hit.is_valid() & (place >= 0)
-                        dr.eval(place, counts)
+                    vertex, met, was = known[split * _JUDGED + step]
+                    place = dr.gather(mi.Int32, labels, vertex, met)
+                    counts = met & (place >= 0)
                     lane = mi.UInt32(dr.maximum(place, 0)) * most + sample.view
-                    errors = []
-                    for shown in (before, after):
-                        radiance, alpha = shown.look(ray, split)
-                        error = dr.abs(tone(radiance) - tone(sample.radiance))
-                        errors.append(dr.sum(error) + coverage * dr.abs(alpha - sample.alpha))
+                    errors = was, self._error(after, split, pixels, tone, sample)
                     for total, value in zip(sums, (mi.Float(1), *errors), strict=True):
                         dr.scatter_reduce(dr.ReduceOp.Add, total, value, lane, counts)
                     dr.eval(sums)
         return verdict_of(*(total.numpy().reshape(-1, views) for total in sums))
+
+    def _seen_before(self, before: Shown, mesh: Mesh | None) -> list[tuple[mi.UInt32, mi.Bool, mi.Float]]:
+        """Of all judging rays, batch by batch: the vertex of a mesh that each meets first, whether it meets
+        any, and its error before a change. One surface is often compared with many, so the last is kept."""
+        if self._last and self._last[0] is before and self._last[1] is (mesh and mesh[0]):
+            return self._last[2]
+        where = mesh and mesh_scene(*mesh)
+        corners = mi.UInt32(mesh[1].astype(np.uint32).ravel()) if mesh else None
+        seen = []
+        for split, (_, pixels) in enumerate(self._pools):
+            tone = Contrast(pixels.mean_radiance())
+            for step in range(_JUDGED):
+                sample = pixels.sample(self.batch, seed=self.seed, step=step)
+                vertex, met = mi.UInt32(0), mi.Bool(True)
+                if where:
+                    hit = where.ray_intersect_preliminary(self._rays(sample), coherent=False)
+                    dr.eval(hit)
+                    met = hit.is_valid()
+                    vertex = dr.gather(mi.UInt32, corners, 3 * hit.prim_index, met)
+                seen.append((vertex, met, self._error(before, split, pixels, tone, sample)))
+                dr.eval(seen[-1])
+        self._last = before, mesh and mesh[0], seen
+        return seen
+
+    def _error(self, shown: Shown, split: int, pixels: PixelPool, tone: Contrast,
+               sample: PixelSample) -> mi.Float:
+        """How badly a surface explains each of some pixels."""
+        # Without masks all of an image is covered: who sees nothing there has explained nothing.
+        coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0) if pixels.has_alpha else 3.0)
+        radiance, alpha = shown.look(self._rays(sample), split)
+        error = dr.abs(tone(radiance) - tone(sample.radiance))
+        return dr.sum(error) + coverage * dr.abs(alpha - sample.alpha)
 
     def decide(self, before: Mesh, after: Mesh) -> Verdict:
         """Judges one change of the whole surface."""
