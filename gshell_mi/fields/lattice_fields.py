@@ -14,6 +14,7 @@ from .. import memory
 from ..errors import UserError
 from ..files import replacing
 from ..lattice import MOST_CELLS, BlockLattice, Lattice, block_count, lattice_of, make_lattice
+from ..lattice.sign_words import is_set
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -112,6 +113,23 @@ class LatticeFields:
             fields = resampled(blocks.points(mi.Float))
         return LatticeFields(**{name: field.numpy() for name, field in fields.items()}, grid=self.grid,
                              blocks=blocks.blocks.numpy(), block_resolution=new.resolution)
+
+    def whole(self) -> LatticeFields:
+        """Fields in blocks on all of their lattice, with neutral weights: elsewhere as at the nearest stored
+        vertex."""
+        lattice = self.lattice
+        if not isinstance(lattice, BlockLattice):
+            return self
+        import drjit as dr
+        import mitsuba as mi
+
+        sdf = mi.Float(self.sdf)
+        # Values at the edge of the blocks may have drifted; on which side it is has not.
+        inside = is_set(lattice.signs(sdf), dr.arange(mi.UInt32, lattice.vertex_count))
+        given = {"sdf": dr.select(inside, -dr.abs(sdf), dr.abs(sdf)), "msdf": mi.Float(self.msdf),
+                 "deform": mi.Float(self.deform)}
+        return LatticeFields(**{name: lattice.spread_out(field).numpy() for name, field in given.items()},
+                             grid=self.grid)
 
     def _resampler(self, lattice: Lattice) -> Callable[[mi.Point3f], dict[str, mi.Float]]:
         """From vertices of another lattice to its fields there, such that the surface stays in place."""

@@ -121,7 +121,7 @@ class _Memory:
         sizes = np.array([sensor.film().crop_size() for sensor in sensors])
         lattices = Lattices.of(subject, self._config)
         volume = self._config.volume.iterations and not subject.filename
-        lattice = lattices.volume if volume else lattices.last
+        lattice = lattices.fine if volume else lattices.last
         estimate = MemoryEstimate.of(self._config, lattice.resolution, sizes, grid=lattice.grid,
                                      report=self._report)
         free = free_memory_of_variant()

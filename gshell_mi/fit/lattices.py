@@ -11,6 +11,7 @@ from ..lattice import Lattice, make_lattice
 
 if TYPE_CHECKING:
     from .config import FitConfig
+    from .surface import Surface
 
 #: The kind of lattice where neither scene nor settings name one. Of equally many cells FlexiCubes come out
 #: nearest to the truth, with the smoothest rims and a third of the vertices of tetrahedra (docs/grids.md).
@@ -28,13 +29,15 @@ class Lattices:
         early: that openings and hollows are found on.
         late: the same vertices, but joined as in the end.
         last: that the fit ends on if it starts from the hull.
-        volume: that it ends on if it starts from a radiance volume.
+        volume: of a radiance volume's surface.
+        fine: that the fit ends on if it starts from that: what is as thin as a leaf has ragged edges on it.
     """
 
     early: Lattice
     late: Lattice
     last: Lattice
     volume: Lattice
+    fine: Lattice
 
     @classmethod
     def of(cls, subject: mi.Shape, config: FitConfig) -> Lattices:
@@ -44,9 +47,14 @@ class Lattices:
         coarse = last.resolution
         if not subject.filename:
             coarse = min(coarse, config.lattice.start_resolution)
-        finest = max(last.resolution, config.volume.resolution)
+        volume = config.resolution or max(last.resolution, config.volume.resolution)
+        fine = config.resolution or max(last.resolution, config.volume.detail_resolution)
         return cls(make_lattice(_EARLY_GRIDS[last.grid], coarse), make_lattice(last.grid, coarse), last,
-                   make_lattice(last.grid, config.resolution or finest))
+                   make_lattice(last.grid, volume), make_lattice(last.grid, fine))
+
+    def end_of(self, surface: Surface) -> Lattice:
+        """What a fit ends on, told by the lattice that its first joint stage was on."""
+        return self.fine if surface.lattice.resolution > self.late.resolution else self.last
 
 
 def last_lattice(subject: mi.Shape, config: FitConfig) -> Lattice:

@@ -57,7 +57,7 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
             Joint("joint", config.joint, config.iterations, lattices.late),     # shape, material and light
             *([Poses(config.cameras)] if config.poses == "refine" else []),     # corrects the cameras
             *([Revision(config.openings)] if revises else []),      # what is open after all
-            Joint("detail", config.detail, config.detail.iterations, lattices.last, refines=True),
+            Joint("detail", config.detail, config.detail.iterations),   # the same on the last lattice
         ]
     else:
         start.append(Joint("joint", config.joint, config.iterations, lattices.last))

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from functools import cached_property
 
 import drjit as dr
+import numpy as np
+from scipy import ndimage
 
 from ..arrays import Array3f, Bool, Field, Float, UInt32
 from ..errors import UserError
@@ -267,6 +269,19 @@ class BlockLattice:
         exists = self.in_lattice(vertex)
         source = self.lattice_vertex(vertex) * channels + (index - vertex * channels)
         return dr.gather(type(field), field, source, exists)
+
+    def spread_out(self, field: Float) -> Float:
+        """A field on the whole lattice, flat with any channels: what is not stored is as the nearest vertex
+        of all those that are. On the host, and as large as the lattice."""
+        channels = dr.width(field) // self.vertex_count
+        vertex = self.lattice_vertex(dr.arange(self._uint_t, self.vertex_count)).numpy()
+        exists = self.in_lattice(dr.arange(self._uint_t, self.vertex_count)).numpy()
+        source = np.full(self.lattice.vertex_count, -1)
+        source[vertex[exists]] = np.flatnonzero(exists)
+        source = source.reshape((self.stride,) * 3)
+        nearest = ndimage.distance_transform_edt(source < 0, return_distances=False, return_indices=True)
+        values = field.numpy().reshape(-1, channels)[source[tuple(nearest)].ravel()]
+        return type(field)(values.ravel())
 
     # Following a surface ------------------------------------------------------------------------------
 

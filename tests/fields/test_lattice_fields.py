@@ -115,3 +115,12 @@ def test_fields_in_blocks_and_files(tmp_path):
     np.savez(tmp_path / "b.npz", sdf=fields.sdf[1:], blocks=fields.blocks, block_resolution=40)
     with pytest.raises(UserError, match=rf"sdf has {fields.sdf.size - 1} values, but its blocks have"):
         LatticeFields.load(tmp_path / "b.npz").lattice  # noqa: B018
+
+
+def test_fields_in_blocks_on_all_of_their_lattice():
+    stored, known = sphere(TetLattice(40), 0.41, in_blocks=True), sphere(TetLattice(40), 0.41)
+    whole = stored.whole()
+    assert whole.lattice == TetLattice(40) and whole.whole() is whole
+    np.testing.assert_array_equal(whole.sdf < 0, known.sdf < 0)
+    near = np.abs(known.sdf) < 3 * TetLattice(40).spacing
+    np.testing.assert_allclose(whole.sdf[near], known.sdf[near], atol=1e-6)

@@ -96,13 +96,8 @@ def test_when_there_is_one(bowl_scene, tmp_path, arguments, stages):
 
 def test_it_goes_over_a_surface_in_blocks_again(bowl_scene):
     """One as fine already, which has changed since material and light were fitted to it."""
-    config = CONFIG.changed({"detail.iterations": 1, "lattice.band_resolution": 40})
-    scene, lattice = load_fit_scene(bowl_scene), FlexiCubesLattice(40)
-    fields = sphere(lattice, RADIUS).in_blocks()
-    count = lattice.vertex_count
-    surface = Surface(fields, seen=Seen(np.full((count, 3), 0.5), np.full(count, True), np.float32(1)))
-    fit = Fit(scene, config, Lattices.of(scene.subject, config))
-    stage = Joint("detail", config.detail, 1, FlexiCubesLattice(40), refines=True)
+    fit, surface = _ball_in_blocks(bowl_scene, {"resolution": 40})
+    stage = Joint("detail", fit.config.detail, 1)
     found = stage.run(fit, surface, Silent())
     assert found.settled and found.lattice.resolution == 40
     assert stage.run(fit, found, Silent()) is found
@@ -110,3 +105,30 @@ def test_it_goes_over_a_surface_in_blocks_again(bowl_scene):
     assert again.settled and again.lattice.resolution == 40
     colors = (surface.model["vertex_color"].reshape(-1, 3).mean(axis=0) for surface in (found, again))
     np.testing.assert_allclose(*colors, atol=0.1, err_msg="the material goes on")
+
+
+def test_a_surface_in_blocks_goes_on_in_finer_ones(bowl_scene):
+    """As one of a radiance volume does."""
+    fit, surface = _ball_in_blocks(bowl_scene, {"resolution": None, "volume.detail_resolution": 80,
+                                                "lattice.start_resolution": 16})
+    stage = Joint("detail", fit.config.detail, 1)
+    found = Joint("joint", fit.config.joint, 1, fit.lattices.late).run(fit, surface, Silent())
+    assert found.settled and found.lattice.resolution == 40
+    fine = stage.run(fit, found, Silent())
+    assert fine.settled and fine.lattice.resolution == 80 and stage.run(fit, fine, Silent()) is fine
+    radius = [np.linalg.norm(fit.scene.subject.surface_of(each.fields).to_numpy()[0], axis=1)
+              for each in (found, fine)]
+    assert len(radius[1]) > 3.5 * len(radius[0])
+    cell = fit.cell(found)
+    assert np.abs(radius[1] - np.median(radius[0])).max() < 0.5 * cell
+    colors = (each.model["vertex_color"].reshape(-1, 3).mean(axis=0) for each in (found, fine))
+    np.testing.assert_allclose(*colors, atol=0.1, err_msg="the material goes on")
+
+
+def _ball_in_blocks(bowl_scene, settings):
+    config = CONFIG.changed({"detail.iterations": 1, "lattice.band_resolution": 40} | settings)
+    scene, lattice = load_fit_scene(bowl_scene), FlexiCubesLattice(40)
+    count = lattice.vertex_count
+    seen = Seen(np.full((count, 3), 0.5), np.full(count, True), np.float32(1))
+    surface = Surface(sphere(lattice, RADIUS).in_blocks(), seen=seen)
+    return Fit(scene, config, Lattices.of(scene.subject, config)), surface

@@ -2,6 +2,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from topology import assert_manifold, boundary_edges
 
 from gshell_mi import UserError
@@ -221,3 +222,17 @@ def test_user_mistakes():
     blocks = BlockLattice.around(lattice, sdf)
     with pytest.raises(UserError, match=f"sdf has 68921 values, but the lattice needs {blocks.vertex_count}"):
         extract(blocks, sdf)
+
+
+def test_what_is_not_stored_is_as_what_is_next_to_it(lattice):
+    blocks = BlockLattice.around(lattice, _ball, mi.Float)
+    points = blocks.points(mi.Float)
+    whole = blocks.spread_out(dr.ravel(points)).numpy().reshape(-1, 3)
+    everywhere = lattice.points(mi.Float).numpy().T
+    exists = blocks.in_lattice(dr.arange(mi.UInt32, blocks.vertex_count)).numpy()
+    vertex = blocks.lattice_vertex(dr.arange(mi.UInt32, blocks.vertex_count)).numpy()[exists]
+    np.testing.assert_array_equal(whole[vertex], everywhere[vertex])
+    _assert_equal_numbers(blocks.take(mi.Float(whole.ravel())).numpy().reshape(-1, 3)[exists],
+                          points.numpy().T[exists])
+    nearest, _ = cKDTree(everywhere[vertex]).query(everywhere)
+    np.testing.assert_allclose(np.linalg.norm(whole - everywhere, axis=1), nearest, atol=1e-5)

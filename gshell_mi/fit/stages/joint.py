@@ -90,22 +90,20 @@ class Joint:
         name: of the stage.
         config: its settings.
         iterations: its steps.
-        lattice: to work on, unless the surface is on a finer one.
-        refines: whether there is nothing to do on a surface that is as fine already, and settled.
+        lattice: to work on, unless the surface is on a finer one; None for the one that the fit ends on, with
+            nothing to do if the surface is on that already, and settled.
     """
 
-    def __init__(self, name: str, config: JointConfig, iterations: int, lattice: Lattice, *,
-                 refines: bool = False):
+    def __init__(self, name: str, config: JointConfig, iterations: int, lattice: Lattice | None = None):
         self.name, self.config, self.iterations, self.lattice = name, config, iterations, lattice
-        self.refines = refines
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface with material and light."""
-        lattice = self.lattice
-        if surface.lattice.resolution >= lattice.resolution:
-            if self.refines and surface.settled:
+        lattice, resolution = self.lattice or fit.lattices.end_of(surface), surface.lattice.resolution
+        if resolution >= lattice.resolution:
+            if not self.lattice and surface.settled:
                 return surface
-            lattice = make_lattice(lattice.grid, surface.lattice.resolution)
+            lattice = make_lattice(lattice.grid, resolution)
         subject, config = fit.scene.subject, fit.config
         fields = start_fields(subject, surface, lattice, config.lattice.band_resolution, steps.kept)
         subject.set_fields(fields)
@@ -143,6 +141,7 @@ def start_fields(subject: mi.Shape, surface: Surface, lattice: Lattice, band_res
     if fields.blocks is not None and fields.lattice.resolution == lattice.resolution:
         return fields
     in_blocks = lattice.resolution >= band_resolution and lattice.fits_in_blocks
+    fields = fields.whole()
     if fields.lattice == lattice:
         return fields.in_blocks() if in_blocks else fields
     resample = fields.in_blocks if in_blocks else fields.to_lattice
@@ -182,15 +181,18 @@ def start_material(scene: FitScene, surface: Surface, lattice: Lattice | BlockLa
 
 
 def _resampled_material(surface: Surface, lattice: Lattice | BlockLattice) -> MaterialField:
-    """The material that a joint stage has left, on another lattice; blocks are not resampled."""
+    """The material that a joint stage has left, on another lattice."""
     points = lattice.points(mi.Float)
     material = MaterialField(np.full((lattice.vertex_count, 3), TYPICAL_REFLECTANCE))
     material.parameters = {name: mi.Float(surface.model[name]) for name in material.parameters}
     before = surface.on_grid(lattice.grid).lattice
-    if isinstance(before, BlockLattice):
+    blocks = isinstance(before, BlockLattice)
+    if blocks and before.resolution == lattice.resolution:
         return material
     for name in material.on_lattice:
-        material.parameters[name] = Interpolation(material.parameters[name], before)(points)
+        given = material.parameters[name]
+        whole = (before.spread_out(given), before.lattice) if blocks else (given, before)
+        material.parameters[name] = Interpolation(*whole)(points)
     return material
 
 
