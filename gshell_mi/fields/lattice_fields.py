@@ -126,10 +126,10 @@ class LatticeFields:
         sdf = mi.Float(self.sdf)
         # Values at the edge of the blocks may have drifted; on which side it is has not.
         inside = is_set(lattice.signs(sdf), dr.arange(mi.UInt32, lattice.vertex_count))
-        given = {"sdf": dr.select(inside, -dr.abs(sdf), dr.abs(sdf)), "msdf": mi.Float(self.msdf),
-                 "deform": mi.Float(self.deform)}
-        return LatticeFields(**{name: lattice.spread_out(field).numpy() for name, field in given.items()},
-                             grid=self.grid)
+        sdf = dr.select(inside, -dr.abs(sdf), dr.abs(sdf))
+        sdf, msdf, deform = (lattice.spread_out(field).numpy()
+                             for field in (sdf, mi.Float(self.msdf), mi.Float(self.deform)))
+        return LatticeFields(sdf, msdf, deform, self.grid)
 
     def _resampler(self, lattice: Lattice) -> Callable[[mi.Point3f], dict[str, mi.Float]]:
         """From vertices of another lattice to its fields there, such that the surface stays in place."""

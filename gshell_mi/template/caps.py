@@ -57,15 +57,15 @@ def put_in_place(sdf: np.ndarray, points: np.ndarray, moved: np.ndarray, faces: 
     Returns:
         (n,) values in cells, and which of them are those of caps.
     """
-    covered = caps[faces].any(axis=1)
+    covered = np.asarray(caps[faces].any(axis=1))
     mesh = trimesh.Trimesh(moved, faces, process=False)
     reach = _BAND * cell
-    low, high = (bound(moved[caps], axis=0) for bound in (np.min, np.max))
-    near = np.flatnonzero(((points > low - reach) & (points < high + reach)).all(axis=1))
+    low, high = np.min(moved[caps], axis=0) - reach, np.max(moved[caps], axis=0) + reach
+    near = np.flatnonzero(np.all((points > low) & (points < high), axis=1))
     face = cKDTree(mesh.triangles_center).query(points[near], min(_CANDIDATES, len(faces)))[1]
     feet = MeshFeet(mesh)(points[near], face)
     told = covered[feet.face] & ((feet.distance < reach) | ((sdf[near] < 0) == (feet.height > 0)))
     smooth, chosen = np.array(sdf), np.zeros(len(sdf), bool)
-    smooth[near[told]] = (np.copysign(feet.distance, feet.height) / cell)[told]
+    smooth[near[told]] = np.copysign(feet.distance[told], feet.height[told]) / cell
     chosen[near[told]] = True
     return smooth, chosen
