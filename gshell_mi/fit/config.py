@@ -183,9 +183,9 @@ _PREVIEW = {"resolution": 48, "iterations": 70, "triptychs": 4, "radiance.batch"
             "render.max_depth": 2, "model.even_start": False, "model.light_height": 16, "texture.rounds": 1,
             "joint.color_hold": 0.0, "openings.revise": False}
 
-#: Twice as many steps of every stage.
+#: Twice as many steps of every stage, and twice as fine an end of what is too thin for hulls.
 _THOROUGH = {name: 2 * value for name, value in FitConfig().settings().items()
-             if name.split(".")[-1] == "iterations"}
+             if name.split(".")[-1] == "iterations" or name == "volume.detail_resolution"}
 
 #: The settings of each effort.
 EFFORTS: dict[str, FitConfig] = {"preview": FitConfig().changed(_PREVIEW), "normal": FitConfig(),

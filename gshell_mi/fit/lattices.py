@@ -30,7 +30,7 @@ class Lattices:
         late: the same vertices, but joined as in the end.
         last: that the fit ends on if it starts from the hull.
         volume: of a radiance volume's surface.
-        fine: that the fit ends on if it starts from that: what is as thin as a leaf has ragged edges on it.
+        fine: that the fit ends on if it starts from that.
     """
 
     early: Lattice
@@ -48,7 +48,7 @@ class Lattices:
         if not subject.filename:
             coarse = min(coarse, config.lattice.start_resolution)
         volume = config.resolution or max(last.resolution, config.volume.resolution)
-        fine = config.resolution or max(last.resolution, config.volume.detail_resolution)
+        fine = config.resolution or max(volume, config.volume.detail_resolution)
         return cls(make_lattice(_EARLY_GRIDS[last.grid], coarse), make_lattice(last.grid, coarse), last,
                    make_lattice(last.grid, volume), make_lattice(last.grid, fine))
 

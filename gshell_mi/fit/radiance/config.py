@@ -19,8 +19,8 @@ class VolumeConfig:
     """Voxels per side of its last level."""
     resolution: Annotated[int, Between(4)] = 128
     """Cells per side of the lattice, at least, if the fit starts from it and --resolution does not say."""
-    detail_resolution: Annotated[int, Between(4)] = 256
-    """Cells per side that the detail stage ends on then, in blocks around the surface."""
+    detail_resolution: Annotated[int, Between(4)] = 128
+    """Cells per side, at least, that the detail stage ends on then, in blocks around the surface."""
     batch: Annotated[int, Between(1)] = 131072
     """Rays per step over all pixels, of which those far from the masks are left out."""
     density_lr: float = 0.3
