@@ -44,10 +44,11 @@ def test_preview_is_less_work_in_every_respect(given):
     assert after["openings.iterations"] >= before["openings.iterations"], "openings need their time"
 
 
-def test_thorough_is_twice_as_many_steps_of_every_stage(given):
+def test_thorough_is_twice_as_many_steps_of_every_stage_and_a_finer_end(given):
     usual, more = given().config.settings(), given("--effort=thorough").config.settings()
     changed = {name for name in usual if more[name] != usual[name]}
-    assert changed == {name for name in usual if name.endswith("iterations")} and len(changed) == 7
+    assert changed == {name for name in usual if name.endswith("iterations")} | {"volume.detail_resolution"}
+    assert len(changed) == 8
     assert all(more[name] == 2 * usual[name] for name in changed)
 
 
