@@ -91,16 +91,18 @@ class ShapeFlow(nn.Module):
         """A set as points; the first one gives the components."""
         device = self.mean.device
         nodes = torch.cat([self._to_nodes(part) for part in data.parts(_CHUNK, device)])
-        if not bool(self.scale.any()):
+        found = bool(self.scale.any())
+        if not found:
+            self.mean.copy_(nodes.mean(dim=0).half())  # as it is stored
+        nodes -= self.mean
+        if not found:
             self._find_components(nodes)
-        return CodedSet((nodes - self.mean) @ self._inverse(), data.kinds.to(device))
+        return CodedSet(nodes @ self._inverse(), data.kinds.to(device))
 
-    def _find_components(self, nodes: Tensor) -> None:
-        self.mean.copy_(nodes.mean(dim=0).half())  # as it is stored
-        centred = nodes - self.mean
+    def _find_components(self, centred: Tensor) -> None:
         # Of few objects by their products, n x n, not by those of tens of thousands of nodes.
         _, vectors = torch.linalg.eigh((centred @ centred.T).double())
-        kept = min(self.components, len(nodes) - 1)
+        kept = min(self.components, len(centred) - 1)
         found = (vectors.flip(1)[:, :kept].T.float() @ centred)  # (kept, values), not normalised
         found = found / found.norm(dim=1, keepdim=True)
         deviation = (centred @ found.T).square().mean(dim=0).sqrt()
