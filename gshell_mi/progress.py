@@ -16,11 +16,10 @@ from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TextColumn
 from rich.progress import Progress as RichProgress
 
+from .bars import PAUSE
+
 #: Steps whose mean duration predicts the time left; old ones say little about a stage that gets slower.
 _WINDOW = 20
-
-#: Seconds between two lines of a stage where there is no terminal.
-_PAUSE = 30.0
 
 
 class Progress:
@@ -67,7 +66,7 @@ class Progress:
         task = self._bars.add_task(name, total=total, completed=done, detail="")
         durations: deque[float] = deque(maxlen=_WINDOW)
         begin = last = time.monotonic()
-        shown = begin - _PAUSE
+        shown = begin - PAUSE
 
         def advance(values: Mapping[str, float] | None = None) -> None:
             nonlocal last, done, shown
@@ -83,7 +82,7 @@ class Progress:
                 quality = f"  PSNR {values['psnr']:.1f} dB" if "psnr" in values else ""
                 detail = f"loss {values['loss']:.4f}{quality}  {detail}"
             self._bars.update(task, completed=done, detail=detail)
-            if now - shown >= _PAUSE:
+            if now - shown >= PAUSE:
                 shown = now
                 self._line(name, detail)
 

@@ -9,9 +9,9 @@ import time
 from collections import deque
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
+from ..bars import Bars
 from ..errors import UserError
 from ..files import replacing
 from ..interrupt import check_interrupt
@@ -83,7 +83,7 @@ def _run_all(ray, waiting: deque[Job], done: dict[str, dict], results: str, addr
         columns = (TextColumn("batch"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
                    TextColumn("{task.fields[rate]}"))
         started, ended = time.perf_counter(), 0
-        with Progress(*columns, console=Console(stderr=True), disable=quiet) as progress:
+        with Bars(*columns, quiet=quiet) as progress:
             bar = progress.add_task("", total=len(waiting) + len(done), completed=len(done), rate="")
             while waiting or running:
                 while waiting and len(running) < _SUBMITTED:

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
-from rich.progress import Progress
 
+from ..bars import Bars
 from ..command_line import run_command
 from ..errors import UserError
 from .config import CaptureConfig
@@ -58,7 +57,7 @@ def _import(given: _Arguments) -> tuple[str, ...]:
     """What had to be made because it was not given."""
     from .run import import_capture
 
-    with Progress(console=Console(stderr=True), transient=True, disable=given.quiet) as bar:
+    with Bars(transient=True, quiet=given.quiet) as bar:
         task = bar.add_task("photographs", total=None)
 
         def show(what: str, done: int, count: int) -> None:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
+from ..bars import Bars
 from ..errors import UserError
 from ..evaluation.mesh_scores import read_mesh
 from ..json_files import read_json_object
@@ -84,7 +84,7 @@ def evaluate(samples: Samples, data: DataSet, *, points: int = 512, emd: int = 3
     trained = train_points[:, :points].astype(np.float32)
     columns = (TextColumn("comparing"), BarColumn(), TextColumn("{task.percentage:.0f} %"),
                TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=quiet) as progress:
+    with Bars(*columns, quiet=quiet) as progress:
         bar = progress.add_task("", total=3 * len(a) + 2 * len(b))
 
         def advance() -> None:

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
+from ..bars import Bars
 from ..doctor import ensure_variant
 from ..errors import UserError
 from ..files import replacing
@@ -68,7 +68,7 @@ def make_data_set(output: Path, places: list[Path], *, garments: int = 0, seed: 
         started, done = time.perf_counter(), 0
         columns = (TextColumn("converting"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
                    TextColumn("{task.fields[rate]}"))
-        with Progress(*columns, console=Console(stderr=True), disable=quiet) as progress:
+        with Bars(*columns, quiet=quiet) as progress:
             bar = progress.add_task("", total=len(sources), rate="",
                                     completed=len(sources) - sum(len(job[1]) for job in jobs))
 

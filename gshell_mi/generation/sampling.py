@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
+from ..bars import Bars
 from ..errors import UserError
 from .model_folder import load_model
 from .models import Steering
@@ -33,7 +33,7 @@ def sample_fields(folder: Path, request: Request) -> tuple[np.ndarray, float]:
     started, found = time.perf_counter(), []
     columns = (TextColumn("sampling"), BarColumn(), TextColumn("{task.percentage:.0f} %"),
                TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=request.quiet) as progress:
+    with Bars(*columns, quiet=request.quiet) as progress:
         batches = range(0, len(kinds), request.batch)
         bar = progress.add_task("", total=request.steps * len(batches))
         for first in batches:

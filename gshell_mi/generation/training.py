@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from safetensors import safe_open
 from safetensors.torch import load_file, save
 from torch import distributed
 
+from ..bars import Bars
 from ..errors import UserError
 from ..files import replacing
 from ..interrupt import check_interrupt, interrupts_held_back
@@ -130,7 +130,7 @@ class _Training:
         self._resume()
         columns = (TextColumn("training"), BarColumn(), TextColumn("{task.percentage:.0f} %"),
                    TimeRemainingColumn(), TextColumn("{task.fields[told]}"))
-        with Progress(*columns, console=Console(stderr=True), disable=quiet) as progress:
+        with Bars(*columns, quiet=quiet) as progress:
             bar = progress.add_task("", total=1.0, told="")
             while True:
                 self._train_stage(data, tests, lambda told: progress.update(

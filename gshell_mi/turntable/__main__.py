@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
+from ..bars import Bars
 from ..command_line import run_command
 from .turntable import TurntableConfig, render_turntable
 from .video import write_video
@@ -43,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _turntable(given: _Arguments) -> None:
     frames = render_turntable(given.folder, given.config, envmap=given.envmap)
     columns = (TextColumn("turntable"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=given.quiet) as progress:
+    with Bars(*columns, quiet=given.quiet) as progress:
         tracked = progress.track(frames, total=given.config.frames)
         files = write_video(tracked, given.output or given.folder / "turntable.mp4", given.config.fps)
     print(*files, sep="\n")
