@@ -50,7 +50,7 @@ LIBRARY = {
     "batch": ("Many jobs", "Fits by the thousand.", ["batch"]),
     "commands": ("Commands and machine", "What the commands share, and what the machine can do.",
                  ["command_line", "streams", "interrupt", "lifetime", "errors", "files", "own_folder",
-                  "memory", "kernel_cache", "timing", "wording", "progress", "doctor"]),
+                  "memory", "kernel_cache", "timing", "wording", "progress", "bars", "doctor"]),
 }
 
 #: Packages of which only the modules right inside are described: what lies deeper may change.

@@ -109,8 +109,8 @@ def test_it_goes_over_a_surface_in_blocks_again(bowl_scene):
 
 def test_a_surface_in_blocks_goes_on_in_finer_ones(bowl_scene):
     """As one of a radiance volume does."""
-    fit, surface = _ball_in_blocks(bowl_scene, {"resolution": None, "volume.detail_resolution": 80,
-                                                "lattice.start_resolution": 16})
+    settings = {"resolution": None, "lattice.start_resolution": 16, "volume.resolution": 40}
+    fit, surface = _ball_in_blocks(bowl_scene, settings | {"volume.detail_resolution": 80})
     stage = Joint("detail", fit.config.detail, 1)
     found = Joint("joint", fit.config.joint, 1, fit.lattices.late).run(fit, surface, Silent())
     assert found.settled and found.lattice.resolution == 40

@@ -29,6 +29,9 @@ from ..stage import Fit
 from ..surface import Surface
 from .openings import OpacityTraining, OpeningsConfig, justified
 
+#: Openings that close one after the other, before all others that are rejected do.
+_CLOSINGS = 7
+
 #: Size of the mSDF of what has closed, at least, in cells.
 _SURE = 0.5
 
@@ -59,8 +62,8 @@ class Revision:
             proposed = appearance.smoothed_logits()
             thickness, opposite = opposite_sides(vertices, vertices, faces, cell)
             thin = np.isfinite(thickness)
-            revised = _with_islands(fit, (vertices, faces), values, proposed)
-            revised, capped, moved = _closed(fit, (vertices, faces), revised, np.where(thin, opposite, -1))
+            revised, capped, moved = _closed(fit, (vertices, faces), values, np.where(thin, opposite, -1))
+            revised = _with_islands(fit, (moved, faces), revised, proposed)
             revised = _opened(fit, (moved, faces), revised, proposed, thin)
             revised = clean_opacity(revised, moved, faces, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
@@ -85,8 +88,9 @@ def _closed(fit: Fit, template: Mesh, values: np.ndarray,
     """Closes openings that explain unseen views no better than caps that go on as their surroundings do.
 
     Nothing has shaped the caps so far, and a hull's bulge explains too little to stand for a surface. Through
-    one opening others are seen, so the worst close first. Where a sheet has one side, what closes the other
-    one is a cell from it, and looks alike.
+    one opening others are seen, a mouth through a hole in the bottom, so the worst closes alone before the
+    others are judged again. Where a sheet has one side, what closes the other one is a cell from it, and
+    looks alike.
 
     Args:
         fit, template, values: as of ``_opened``.
@@ -97,7 +101,10 @@ def _closed(fit: Fit, template: Mesh, values: np.ndarray,
     """
     (vertices, faces), thin, opened = template, opposite >= 0, values <= 0
     smooth, positions = least_bent(vertices, faces, opened & ~thin), vertices
-    while (chosen := values <= 0).any():
+    for closing in reversed(range(_CLOSINGS)):
+        chosen = values <= 0
+        if not chosen.any():
+            break
         place = places_of(chosen, lobes(chosen, faces))
         now = fit.judge.shown(positive_part(positions, faces, values))
         whole = fit.judge.shown((smooth, faces), like=now)
@@ -107,7 +114,8 @@ def _closed(fit: Fit, template: Mesh, values: np.ndarray,
         gain = np.where(np.isfinite(verdict.noise) & alone, verdict.gain, 0)
         if gain.max() <= 0:
             break
-        values = np.where(chosen & (gain >= WORST * gain.max())[place], -values, values)
+        rejected = gain == gain.max() if closing else gain > 0
+        values = np.where(chosen & rejected[place], -values, values)
         positions = np.where((opened & (values > 0))[:, None], smooth, vertices)
     return values, opened & (values > 0), positions
 

@@ -81,7 +81,7 @@ def test_a_bulge_that_is_open_closes_without_it(fit, opened):
     points = lattice.points(mi.Float).numpy().T
     lowest = vertices_of(fit, before)[:, 1].min()
     bulge = np.linalg.norm(points - [0, lowest, 0], axis=1) - 2.2 * lattice.spacing
-    torn = cut(fit, before, lambda points: (bulge < 0.5 * lattice.spacing) & (points[:, 1] < -0.3))
+    torn = cut(fit, before, lambda points: bulge < 1.5 * lattice.spacing)
     torn = torn.with_fields(sdf=np.minimum(torn.fields.sdf, bulge).astype(np.float32))
     assert loops(fit, torn).boundary_loops == 2
     mended, _ = revised(fit, torn)
