@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from cholespy import CholeskySolverF, MatrixType
-from scipy.sparse import coo_matrix, eye
+from scipy.sparse import coo_matrix, csr_matrix, eye
 from scipy.sparse.csgraph import laplacian
 
 from ..lattice import MISSING, BlockLattice, Lattice
@@ -150,6 +150,17 @@ class LatticeDiffusion:
         return dr.select(original_here | reached_here, total / divisor, 0), known
 
 
+def mesh_laplacian(faces: np.ndarray, vertex_count: int) -> csr_matrix:
+    """(V, V) combinatorial Laplacian of a mesh: how many neighbours a vertex has, less one for each of them.
+
+    >>> mesh_laplacian(np.array([[0, 1, 2]]), 3).toarray().tolist()
+    [[2.0, -1.0, -1.0], [-1.0, 2.0, -1.0], [-1.0, -1.0, 2.0]]
+    """
+    start, end = mesh_edges(faces)[0].T
+    adjacency = coo_matrix((np.ones(len(start)), (start, end)), shape=(vertex_count, vertex_count))
+    return laplacian(adjacency + adjacency.T).tocsr()
+
+
 class MeshDiffusion:
     """Solves ``(I + smoothing L) x = b`` with the combinatorial Laplacian L of a mesh (Nicolet et al. 2021).
 
@@ -164,9 +175,7 @@ class MeshDiffusion:
     """
 
     def __init__(self, faces: np.ndarray, vertex_count: int, smoothing: float):
-        start, end = mesh_edges(faces)[0].T
-        adjacency = coo_matrix((np.ones(len(start)), (start, end)), shape=(vertex_count, vertex_count))
-        system = (eye(vertex_count) + smoothing * laplacian(adjacency + adjacency.T)).tocoo()
+        system = (eye(vertex_count) + smoothing * mesh_laplacian(faces, vertex_count)).tocoo()
         self._count = vertex_count
         # Dr.Jit's arrays tell where to solve: on the CPU or the GPU.
         self._solver = CholeskySolverF(vertex_count, mi.Int32(system.row), mi.Int32(system.col),

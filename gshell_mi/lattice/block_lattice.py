@@ -274,10 +274,10 @@ class BlockLattice:
         """A field on the whole lattice, flat with any channels: what is not stored is as the nearest vertex
         of all those that are. On the host, and as large as the lattice."""
         channels = dr.width(field) // self.vertex_count
-        vertex = self.lattice_vertex(dr.arange(self._uint_t, self.vertex_count)).numpy()
-        exists = self.in_lattice(dr.arange(self._uint_t, self.vertex_count)).numpy()
+        stored = dr.arange(self._uint_t, self.vertex_count)
+        exists = self.in_lattice(stored).numpy()
         source = np.full(self.lattice.vertex_count, -1)
-        source[vertex[exists]] = np.flatnonzero(exists)
+        source[self.lattice_vertex(stored).numpy()[exists]] = np.flatnonzero(exists)
         source = source.reshape((self.stride,) * 3)
         nearest = ndimage.distance_transform_edt(source < 0, return_distances=False, return_indices=True)
         values = field.numpy().reshape(-1, channels)[source[tuple(nearest)].ravel()]

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-from scipy.sparse import coo_matrix, diags, eye
+from scipy.sparse import diags, eye
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from ..conversion.mesh_distance import MeshFeet
-from ..topology import mesh_edges
+from ..fields.smoothing import mesh_laplacian
 
 #: What holds a cap without surroundings in place, as a share of what bends it.
 _HELD = 1e-6
@@ -31,11 +31,8 @@ def least_bent(vertices: np.ndarray, faces: np.ndarray, free: np.ndarray) -> np.
     chosen, moved = np.flatnonzero(free), np.array(vertices, np.float64)
     if not len(chosen):
         return moved
-    start, end = mesh_edges(faces)[0].T
-    adjacency = coo_matrix((np.ones(len(start)), (start, end)), shape=(len(vertices),) * 2)
-    adjacency = (adjacency + adjacency.T).tocsr()
-    degree = np.maximum(np.asarray(adjacency.sum(axis=1)).ravel(), 1)
-    bending = eye(len(vertices)) - diags(1 / degree) @ adjacency
+    laplacian = mesh_laplacian(faces, len(vertices))
+    bending = diags(1 / np.maximum(laplacian.diagonal(), 1)) @ laplacian
     energy = (bending.T @ bending).tocsc()[:, chosen]
     system = energy[chosen] + _HELD * eye(len(chosen))
     moved[chosen] -= spsolve(system.tocsc(), energy.T @ moved)
