@@ -26,6 +26,11 @@ from .plain_float_images import (
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 #: First bytes of what Mitsuba reads besides: Radiance, PFM, PPM, PNG, JPEG and BMP. TGA it reads unchecked.
 _MITSUBA_KINDS = (b"#?", b"PF", b"Pf", b"P6", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"BM")
+#: Rows that are packed together, by the compression.
+_ROWS = {"NO": 1, "RLE": 1, "ZIPS": 1, "ZIP": 16, "PXR24": 16, "PIZ": 32, "B44": 32, "B44A": 32, "DWAA": 32,
+         "DWAB": 256}
+#: Flags of files with other than one part of rows: tiles, deep pixels or several parts.
+_NO_ROWS = 0x1A00
 #: Windows and sizes beyond these shares of each other come from damaged headers.
 _MOST_EMPTY, _MOST_PACKED = 100, 1 << 14
 #: What programs call the layer with the picture, if several layers have colours.
@@ -139,8 +144,37 @@ def _stored(path: Path, number: int, names: list[str]) -> dict[str, np.ndarray]:
     file = OpenEXR.InputFile(str(path))
     if not file.isComplete():
         raise ValueError("it is cut off")
+    _check_rows(path)
     read = file.channels(names, Imath.PixelType(Imath.PixelType.FLOAT))
     return {name: np.frombuffer(values, np.float32) for name, values in zip(names, read, strict=True)}
+
+
+def _check_rows(path: Path) -> None:
+    """Whether the rows of a file are where its table says.
+
+    Newer readers take what is there instead. Mitsuba's raises an exception in one of its threads, which now
+    and then ends the process.
+
+    Raises:
+        ValueError: they are not.
+    """
+    data, header = path.read_bytes(), _open(path, header_only=True).parts[0].header
+    step = _ROWS.get(header["compression"].name.removesuffix("_COMPRESSION"))
+    if step is None or int.from_bytes(data[4:8], "little") & _NO_ROWS:
+        return
+    at = 8
+    while data[at]:    # name and type of an attribute, which end with a 0, and the size of its value
+        for _ in range(2):
+            at = data.index(0, at) + 1
+        at += 4 + int.from_bytes(data[at:at + 4], "little")
+    top, bottom = (int(corner[1]) for corner in header["dataWindow"])
+    rows = np.arange(top, bottom + 1, step)
+    table = np.frombuffer(data, "<u8", len(rows), at + 1)
+    if table.max() > len(data) - 8:
+        raise ValueError("it is damaged")
+    places = table.astype(np.int64)[:, None] + np.arange(4)
+    if (np.frombuffer(data, np.uint8)[places].copy().view("<i4")[:, 0] != rows).any():
+        raise ValueError("it is damaged")
 
 
 def _size(window: tuple[np.ndarray, np.ndarray]) -> tuple[int, int]:

@@ -27,9 +27,11 @@ def check_triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     """The same arrays without the vertices that no face uses.
 
     Raises:
-        ValueError: with the rest of a sentence: a face has a vertex that there is not, a position is not
-            finite, or no face has an area.
+        ValueError: with the rest of a sentence: positions lack a coordinate, a face has a vertex that there
+            is not, a position is not finite, or no face has an area.
     """
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError("has vertices with other than three coordinates")
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError("has faces of vertices that it lacks")
     used, faces = np.unique(faces, return_inverse=True)

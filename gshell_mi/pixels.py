@@ -40,6 +40,11 @@ class PixelSample:
     radiance: mi.Color3f
     alpha: mi.Float
 
+    def at(self, lane: mi.UInt32) -> PixelSample:
+        """The same on some lanes."""
+        return PixelSample(*(dr.gather(type(value), value, lane)
+                             for value in (self.view, self.film, self.radiance, self.alpha)))
+
 
 class PixelPool:
     """The pixels of targets, whatever their sizes, each equally likely to be drawn.

@@ -19,7 +19,7 @@ import mitsuba as mi
 from .compat import MITSUBA_INTEGRATORS, mitsuba_folder, trust_only_own_plugins
 from .environment_maps import read_environment_map
 from .errors import UserError
-from .float_images import check_for_mitsuba, is_exr
+from .float_images import check_for_mitsuba, is_exr, read_float_image
 
 #: Python plugins of this package.
 OWN_PLUGINS = ("gshell", "gshell_path", "gshell_mask")
@@ -162,9 +162,8 @@ def _check_images(props: mi.Properties) -> None:
         if not _is_plain_exr(path):
             raise ValueError(f"image '{path}' has a data window other than its display window, which Mitsuba "
                              f"cannot read; write it without a border or crop")
-        return
     try:
-        check_for_mitsuba(path)
+        (read_float_image if is_exr(path) else check_for_mitsuba)(path)
     except Exception as error:
         raise ValueError(f"image '{path}' cannot be read ({error}); write it again, as PNG or "
                          f"OpenEXR") from error

@@ -20,20 +20,28 @@ class ScriptedJudge:
         self.count, self.error, self.noise = count, error, noise
         self.asked: list[np.ndarray] = []
 
-    def shown(self, mesh: Mesh, like: np.ndarray | None = None) -> np.ndarray:
-        """(V,) which of the template's vertices are opaque."""
-        opaque = np.zeros(self.count, bool)
-        used = np.unique(mesh[1])
-        opaque[used[used < self.count]] = True
-        self.asked.append(opaque)
-        return opaque
+    def parts(self, template: Mesh) -> "ScriptedParts":
+        """Of the template."""
+        return ScriptedParts(template[1], self)
 
-    def compare(self, before: np.ndarray, after: np.ndarray, places: tuple[Mesh, np.ndarray]) -> Verdict:
+    def compare_parts(self, before: np.ndarray, after: np.ndarray, label: np.ndarray) -> Verdict:
         """By the mean errors of each place's vertices."""
-        label = places[1]
         told = label >= 0
         number = np.maximum(np.bincount(label[told]), 1)
         first, second = (np.bincount(label[told], self.error(opaque)[told]) / number
                          for opaque in (before, after))
         gain = np.log(np.maximum(first, 1e-9) / np.maximum(second, 1e-9))
         return Verdict(first, second, gain, np.full(len(gain), self.noise))
+
+
+class ScriptedParts:
+    """Parts of a template are (V,) which of its vertices are opaque."""
+
+    def __init__(self, faces: np.ndarray, judge: ScriptedJudge):
+        self.faces, self._judge = faces, judge
+        self.all = self.of(np.ones(judge.count))
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """What is positive."""
+        self._judge.asked.append(values > 0)
+        return values > 0

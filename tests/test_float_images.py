@@ -100,6 +100,31 @@ def test_damaged_files_are_told_without_a_word_of_the_library(tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("compression", ["NO", "ZIPS", "ZIP", "PIZ", "DWAA", "DWAB", "RLE", "PXR24", "B44"])
+def test_rows_that_say_to_be_others(compression, tmp_path):
+    """Mitsuba's reader ends the process at these, now and then."""
+    path = tmp_path / "a.exr"
+    pixels = np.tile(np.linspace(0, 1, 300, dtype=np.float32)[:, None], (1, 8))
+    with OpenEXR.File({"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"),
+                       "type": OpenEXR.scanlineimage}, {"Y": pixels}) as file:
+        file.write(str(path))
+    np.testing.assert_allclose(read_float_image(path)[0][..., 0], pixels, atol=0.01)
+    data = bytearray(path.read_bytes())
+    offsets = np.frombuffer(bytes(data), "<u8", 2, _end_of_header(data))
+    data[offsets[1]:offsets[1] + 4] = (7777).to_bytes(4, "little")
+    path.write_bytes(data)
+    with pytest.raises((ValueError, OSError, RuntimeError)):
+        read_float_image(path)
+
+
+def _end_of_header(data: bytes) -> int:
+    at = 8
+    while data[at]:
+        at = data.index(0, data.index(0, at) + 1) + 1
+        at += 4 + int.from_bytes(data[at:at + 4], "little")
+    return at + 1
+
+
 def test_headers_that_promise_too_much(tmp_path):
     path = write(tmp_path / "a.exr", PIXELS, display=((0, 0), (15999, 15999)))
     with pytest.raises(ValueError, match="nearly all empty"):

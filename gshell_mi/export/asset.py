@@ -85,7 +85,8 @@ def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
     fine = read_ply(folder / "mesh.ply")
     if len(fine.faces) == 0:
         raise UserError(f"'{folder / 'mesh.ply'}' is empty; there is nothing to export.")
-    lacking = [name for name in ("color", "roughness", "metallic") if name not in fine.attributes]
+    lacking = [name for name, axes in (("color", 2), ("roughness", 1), ("metallic", 1))
+               if np.ndim(fine.attributes.get(name, 0)) != axes]
     if lacking:
         raise UserError(f"'{folder / 'mesh.ply'}' has no {lacking[0]}; run the fit again, which writes it.")
     names = ["mesh.glb", *(_OBJ_FILES if config.obj else ())]

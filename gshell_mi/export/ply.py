@@ -72,7 +72,7 @@ def read_ply(path: Path) -> FittedMesh:
         for name in sorted(columns):
             stem, _, channel = name.rpartition("_")
             attributes.setdefault(stem, []).append((int(channel), columns[name]))
-        _check(mesh, stacked, columns)
+        _check(mesh, stacked, columns, attributes)
     except Exception as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
         raise UserError(f"'{path}' cannot be read as a fitted mesh ({reason}); run the fit again.") from error
@@ -81,7 +81,11 @@ def read_ply(path: Path) -> FittedMesh:
         for name, channels in attributes.items()})
 
 
-def _check(mesh: trimesh.Trimesh, stacked: dict[str, np.ndarray], columns: dict[str, np.ndarray]) -> None:
+def _check(mesh: trimesh.Trimesh, stacked: dict[str, np.ndarray], columns: dict[str, np.ndarray],
+           attributes: dict[str, list[tuple[int, np.ndarray]]]) -> None:
+    for name, channels in attributes.items():
+        if sorted(number for number, _ in channels) not in ([0], [0, 1, 2]):
+            raise ValueError(f"its {name} has neither one channel nor three")
     check_triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64))
     for name, values in [("position", stacked["p"]), ("normal", stacked["n"]), *columns.items()]:
         if not np.isfinite(values).all():

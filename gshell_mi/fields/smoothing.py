@@ -172,11 +172,14 @@ class MeshDiffusion:
         faces: (F, 3) vertex indices.
         vertex_count: V.
         smoothing: lambda; features of about sqrt(lambda) edges remain.
+
+    Attributes:
+        count: vertices.
     """
 
     def __init__(self, faces: np.ndarray, vertex_count: int, smoothing: float):
         system = (eye(vertex_count) + smoothing * mesh_laplacian(faces, vertex_count)).tocoo()
-        self._count = vertex_count
+        self.count = vertex_count
         # Dr.Jit's arrays tell where to solve: on the CPU or the GPU.
         self._solver = CholeskySolverF(vertex_count, mi.Int32(system.row), mi.Int32(system.col),
                                        mi.Float64(system.data), MatrixType.COO)
@@ -189,16 +192,16 @@ class MeshDiffusion:
         """The same of several fields at once: four columns are solved for in the time of one."""
         if not fields:
             return {}
-        channels = {name: dr.width(field) // self._count for name, field in fields.items()}
-        vertex = dr.arange(mi.UInt32, self._count)
+        channels = {name: dr.width(field) // self.count for name, field in fields.items()}
+        vertex = dr.arange(mi.UInt32, self.count)
         columns = [dr.gather(mi.Float, field, vertex * channels[name] + channel)
                    for name, field in fields.items() for channel in range(channels[name])]
-        shape = (self._count, len(columns))
+        shape = (self.count, len(columns))
         solution = dr.empty(mi.TensorXf, shape=shape)
         self._solver.solve(mi.TensorXf(dr.ravel(mi.ArrayXf(columns), order="F"), shape), solution)
         diffused, first = {}, 0
         for name, count in channels.items():
-            index = dr.arange(mi.UInt32, self._count * count)
+            index = dr.arange(mi.UInt32, self.count * count)
             place = index // count * len(columns) + first + index % count
             diffused[name] = dr.gather(mi.Float, solution.array, place)
             first += count

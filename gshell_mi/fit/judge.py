@@ -14,6 +14,8 @@ from ..pixels import PixelPool, PixelSample
 from ..targets import Target
 from ..views import PinholeViews
 from .radiance.contrast import Contrast
+from .radiance.lanes import chosen_lanes
+from .radiance.parts import Part, Parts, TracedMesh
 from .radiance.shown import Mesh, Shown
 
 #: Pixels this near to a mask's outline do not judge: where a surface ends to a cell is found later.
@@ -79,7 +81,6 @@ class Judge:
                  splits: list[tuple[np.ndarray, np.ndarray]], *, batch: int, seed: int = 0):
         self.views, self.targets, self.splits = views, targets, splits
         self.batch, self.seed = batch, seed
-        self._last: tuple[Shown, np.ndarray | None, list] | None = None
 
     @staticmethod
     def halves(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -107,54 +108,59 @@ class Judge:
                 the change at the vertex that it meets first. Default: all rays judge one change.
         """
         mesh, label = places or (None, np.zeros(1, np.int32))
-        count, views = int(label.max()) + 1, len(self.views)
-        sums = [dr.zeros(mi.Float, max(count, 1) * views) for _ in range(3)]
-        labels, most = mi.Int32(label.astype(np.int32)), dr.opaque(mi.UInt32, views)
-        with dr.suspend_grad():
-            known = self._seen_before(before, mesh)
-            for split, (_, pixels) in enumerate(self._pools):
-                tone = Contrast(pixels.mean_radiance())
-                for step in range(_JUDGED):
-                    sample = pixels.sample(self.batch, seed=self.seed, step=step)
-                    vertex, met, was = known[split * _JUDGED + step]
-                    place = dr.gather(mi.Int32, labels, vertex, met)
-                    counts = met & (place >= 0)
-                    lane = mi.UInt32(dr.maximum(place, 0)) * most + sample.view
-                    errors = was, self._error(after, split, pixels, tone, sample)
-                    for total, value in zip(sums, (mi.Float(1), *errors), strict=True):
-                        dr.scatter_reduce(dr.ReduceOp.Add, total, value, lane, counts)
-                    dr.eval(sums)
-        return verdict_of(*(total.numpy().reshape(-1, views) for total in sums))
-
-    def _seen_before(self, before: Shown, mesh: Mesh | None) -> list[tuple[mi.UInt32, mi.Bool, mi.Float]]:
-        """Of all judging rays, batch by batch: the vertex of a mesh that each meets first, whether it meets
-        any, and its error before a change. One surface is often compared with many, so the last is kept."""
-        if self._last and self._last[0] is before and self._last[1] is (mesh and mesh[0]):
-            return self._last[2]
         where = mesh and mesh_scene(*mesh)
         corners = mi.UInt32(mesh[1].astype(np.uint32).ravel()) if mesh else None
-        seen = []
-        for split, (_, pixels) in enumerate(self._pools):
-            tone = Contrast(pixels.mean_radiance())
-            for step in range(_JUDGED):
-                sample = pixels.sample(self.batch, seed=self.seed, step=step)
-                vertex, met = mi.UInt32(0), mi.Bool(True)
-                if where:
-                    hit = where.ray_intersect_preliminary(self._rays(sample), coherent=False)
-                    dr.eval(hit)
-                    met = hit.is_valid()
-                    vertex = dr.gather(mi.UInt32, corners, 3 * hit.prim_index, met)
-                seen.append((vertex, met, self._error(before, split, pixels, tone, sample)))
-                dr.eval(seen[-1])
-        self._last = before, mesh and mesh[0], seen
-        return seen
+        sums = _Sums(label, len(self.views))
+        with dr.suspend_grad():
+            for split, (_, pixels) in enumerate(self._pools):
+                for step in range(_JUDGED):
+                    sample = pixels.sample(self.batch, seed=self.seed, step=step)
+                    vertex, met = dr.zeros(mi.UInt32, dr.width(sample.view)), mi.Bool(True)
+                    if where:
+                        hit = where.ray_intersect_preliminary(self._rays(sample), coherent=False)
+                        dr.eval(hit)
+                        met = hit.is_valid()
+                        vertex = dr.gather(mi.UInt32, corners, 3 * hit.prim_index, met)
+                    lane = sums.told(vertex, met)
+                    if not dr.width(lane):
+                        continue
+                    sample, ray = sample.at(lane), self._rays(sample.at(lane))
+                    errors = [self._error(split, sample, *shown.look(ray, split))
+                              for shown in (before, after)]
+                    sums.add(dr.gather(mi.UInt32, vertex, lane), sample.view, errors)
+        return sums.verdict()
 
-    def _error(self, shown: Shown, split: int, pixels: PixelPool, tone: Contrast,
-               sample: PixelSample) -> mi.Float:
-        """How badly a surface explains each of some pixels."""
+    def parts(self, template: Mesh, like: Shown) -> Parts:
+        """Parts of a template, which mirror what something else of the surface does."""
+        return Parts(TracedMesh(template, self.views), self._pools, [look.mirrored for look in like.looks],
+                     batch=self.batch, judged=_JUDGED, seed=self.seed)
+
+    def compare_parts(self, before: Part, after: Part, label: np.ndarray) -> Verdict:
+        """Judges a change of what there is of a template.
+
+        Args:
+            before, after: parts of the same template.
+            label: (V,) as of ``compare``, of the template.
+        """
+        sums = _Sums(label, len(self.views))
+        with dr.suspend_grad():
+            for split, rays in enumerate(before.parts.judging):
+                vertex = rays.met.vertices[0] >> 1
+                lane = sums.told(vertex, rays.met.hit)
+                if not dr.width(lane):
+                    continue
+                some = rays.at(lane)
+                was = [dr.gather(type(value), value, lane) for value in before.looks[split]]
+                errors = [self._error(split, some.pixel, *look) for look in (was, after.look(some, split))]
+                sums.add(dr.gather(mi.UInt32, vertex, lane), some.pixel.view, errors)
+        return sums.verdict()
+
+    def _error(self, split: int, sample: PixelSample, radiance: mi.Color3f, alpha: mi.Float) -> mi.Float:
+        """How badly what is seen explains each of some pixels."""
+        pixels = self._pools[split][1]
+        tone = Contrast(pixels.mean_radiance())
         # Without masks all of an image is covered: who sees nothing there has explained nothing.
         coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0) if pixels.has_alpha else 3.0)
-        radiance, alpha = shown.look(self._rays(sample), split)
         error = dr.abs(tone(radiance) - tone(sample.radiance))
         return dr.sum(error) + coverage * dr.abs(alpha - sample.alpha)
 
@@ -164,6 +170,35 @@ class Judge:
 
     def _rays(self, sample: PixelSample) -> mi.Ray3f:
         return self.views.rays(sample.view, sample.film)
+
+
+class _Sums:
+    """Errors before and after, added up for each place and view.
+
+    Args:
+        label: (V,) which place a vertex belongs to; -1 if none.
+        views: their number.
+    """
+
+    def __init__(self, label: np.ndarray, views: int):
+        self._views, self._most = views, dr.opaque(mi.UInt32, views)
+        self._labels = mi.Int32(label.astype(np.int32))
+        self._sums = [dr.zeros(mi.Float, max(int(label.max()) + 1, 1) * views) for _ in range(3)]
+
+    def told(self, vertex: mi.UInt32, met: mi.Bool) -> mi.UInt32:
+        """Lanes of rays that tell of a place, by the vertex that they meet."""
+        return chosen_lanes(met & (dr.gather(mi.Int32, self._labels, vertex, met) >= 0), vertex)
+
+    def add(self, vertex: mi.UInt32, view: mi.UInt32, errors: list[mi.Float]) -> None:
+        """Adds rays that tell."""
+        lane = mi.UInt32(dr.gather(mi.Int32, self._labels, vertex)) * self._most + view
+        for total, value in zip(self._sums, (mi.Float(1), *errors), strict=True):
+            dr.scatter_reduce(dr.ReduceOp.Add, total, value, lane)
+        dr.eval(self._sums)
+
+    def verdict(self) -> Verdict:
+        """Of all that was added."""
+        return verdict_of(*(total.numpy().reshape(-1, self._views) for total in self._sums))
 
 
 def places_of(chosen: np.ndarray, patch: np.ndarray) -> np.ndarray:

@@ -333,6 +333,15 @@ def test_missing_and_broken_mesh(tmp_path):
         read_ply(tmp_path / "mesh.ply")
 
 
+@pytest.mark.parametrize("channels", [2, 4])
+def test_a_mesh_with_another_number_of_channels(tmp_path, channels):
+    """As one byte of a name in its header makes them."""
+    square, up = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.tile([0, 0, 1], (3, 1))
+    write_ply(tmp_path / "mesh.ply", square, np.array([[0, 1, 2]]), up, {"color": np.zeros((3, channels))})
+    with pytest.raises(UserError, match=r"its color has neither one channel nor three.*run the fit again"):
+        read_ply(tmp_path / "mesh.ply")
+
+
 def test_empty_mesh(tmp_path):
     attributes = {"vertex_color": np.zeros((0, 3)), "vertex_roughness": np.zeros(0)}
     write_ply(tmp_path / "mesh.ply", np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)), attributes)

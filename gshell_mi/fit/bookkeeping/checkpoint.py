@@ -163,10 +163,15 @@ def optimizer_arrays(name: str, optimizer: mi.ad.Adam) -> dict[str, np.ndarray]:
 
 
 def restore_optimizer(name: str, optimizer: mi.ad.Adam, arrays: Mapping[str, np.ndarray]) -> None:
-    """Puts back what ``optimizer_arrays`` saved into an optimiser with the same parameters."""
+    """Puts back what ``optimizer_arrays`` saved into an optimiser with the same parameters.
+
+    Raises:
+        UserError: the sizes are others.
+    """
     for key, (value, promoted, rate, (step, first, second, maximum)) in list(optimizer.state.items()):
         stored = {part: arrays[f"{name}/{key}/{part}"] for part in ("value", "step", "first", "second")}
-        if stored["value"].shape != value.shape:
+        if any(stored[part].shape != now.shape for part, now in (
+                ("value", value), ("step", step), ("first", first), ("second", second))):
             raise UserError(f"The checkpoint's '{name}/{key}' has another size than this fit needs; start "
                             f"again with --overwrite.")
         restored = type(value)(stored["value"])

@@ -71,7 +71,8 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
     if not fit.config.watertight:
         # Now that what lies behind is in its place, the images may justify more openings.
         proposed = clean(np.where(_in_empty_space(after, volume, opacity, seen), -_CERTAIN, cleaned))
-        justified = close_rejected(proposed, after.closed, fit.judge, fit.judge.shown(after.closed))
+        parts = fit.judge.parts(after.closed, fit.judge.shown(after.closed))
+        justified = close_rejected(proposed, parts, fit.judge, parts.all)
         # Those that there were have been judged, and a close call may come out otherwise now.
         cleaned = clean(np.where(cleaned > 0, justified, proposed))
     radiance = fitted_radiance(after, fit).radiance()[0]

@@ -7,9 +7,8 @@ import numpy as np
 
 from ...fields.smoothing import MeshDiffusion
 from ...topology import equal_patches, lobes, patch_sizes, vertex_components
-from ...triangles import positive_part
 from ..judge import Judge, places_of
-from .shown import Mesh, Shown
+from .parts import Part, Parts
 
 #: Rounds in which openings are closed; in the last one all that are rejected.
 _CLOSINGS = 7
@@ -45,7 +44,7 @@ def close_shallow(logits: np.ndarray, faces: np.ndarray, thin: np.ndarray) -> np
     return np.where(opened & shallow[patch], -logits, logits)
 
 
-def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge, before: Shown,
+def close_rejected(logits: np.ndarray, parts: Parts, judge: Judge, before: Part,
                    given: np.ndarray | None = None) -> np.ndarray:
     """Closes the openings through which unseen views are not explained better than without them.
 
@@ -58,15 +57,15 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge, before: Sho
 
     Args:
         logits: (V,) opacity logits; surface where positive.
-        template: the mesh that is opened.
+        parts: of the template.
         judge: of the fit.
-        before: the template without these openings as the judge shows it.
+        before: the template without these openings.
         given: (V,) openings that have been justified; default: none.
 
     Returns:
         (V,) logits, those of rejected openings negated.
     """
-    faces = template[1]
+    faces = parts.faces
     given = np.zeros(len(logits), bool) if given is None else given
     opened = (logits <= 0) & ~given
     if not opened.any():
@@ -77,8 +76,8 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge, before: Sho
     kept, trimmed = opened, np.zeros_like(opened)
     for closing in reversed(range(_CLOSINGS)):
         place = places_of(kept, lobes(kept, faces))
-        shown = _shown(judge, template, ~(kept | given), logits, before)
-        verdict = judge.compare(before, shown, (template, place))
+        after = parts.of(np.where(kept | given, -np.abs(logits), np.abs(logits)))
+        verdict = judge.compare_parts(before, after, place)
         worst = ~verdict.accepted
         # The worst first; all where none is worse but some are not surely better, and in the last round.
         if closing:
@@ -89,7 +88,7 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge, before: Sho
             break
         anew = rejected & ~trimmed
         if closing and anew.any():
-            anew &= _gains(judge, template, before, shown, anew) > 0
+            anew &= _gains(judge, faces, before, after, anew) > 0
             # Crumbs of what is rejected are chance: there are so many of them.
             share = np.bincount(place[kept], anew[kept]) / np.bincount(place[kept])
             anew &= share[place] > 0.5
@@ -102,43 +101,36 @@ def close_rejected(logits: np.ndarray, template: Mesh, judge: Judge, before: Sho
     return np.where(opened & ~kept, -logits, logits)
 
 
-def open_rejected(logits: np.ndarray, template: Mesh, judge: Judge, closed: Shown) -> np.ndarray:
+def open_rejected(logits: np.ndarray, parts: Parts, judge: Judge) -> np.ndarray:
     """Opens the islands in openings that unseen views do not speak for.
 
     A highlight on the inside of a bowl may be explained by a piece of the lid.
 
     Args:
-        logits, template, judge, closed: as of ``close_rejected``, closed everywhere.
+        logits, parts, judge: as of ``close_rejected``.
 
     Returns:
         (V,) logits, those of rejected islands negated.
     """
-    faces = template[1]
+    faces = parts.faces
     solid = logits > 0
     patch = equal_patches(solid, faces)
-    part = vertex_components(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(logits))[1]
-    size, largest = patch_sizes(patch, part, solid)
+    piece = vertex_components(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(logits))[1]
+    size, largest = patch_sizes(patch, piece, solid)
     island = solid & (size < largest)
     if not island.any():
         return logits
     place = places_of(island, patch)
-    without, present = (_shown(judge, template, chosen, logits, closed)
+    without, present = (parts.of(np.where(chosen, np.abs(logits), -np.abs(logits)))
                         for chosen in (solid & ~island, solid))
-    accepted = judge.compare(without, present, (template, place)).accepted
+    accepted = judge.compare_parts(without, present, place).accepted
     return np.where(island & ~accepted[place], -logits, logits)
 
 
-def _gains(judge: Judge, template: Mesh, before: Shown, after: Shown, chosen: np.ndarray) -> np.ndarray:
+def _gains(judge: Judge, faces: np.ndarray, before: Part, after: Part, chosen: np.ndarray) -> np.ndarray:
     """(V,) what each ``chosen`` vertex tells of a change, smoothed along the template; up to a factor."""
     count = len(chosen)
     place = places_of(chosen, np.arange(count))
-    gain = np.where(chosen, judge.compare(before, after, (template, place)).gain[place], 0)
-    smooth = MeshDiffusion(template[1], count, _SMOOTHING)
+    gain = np.where(chosen, judge.compare_parts(before, after, place).gain[place], 0)
+    smooth = MeshDiffusion(faces, count, _SMOOTHING)
     return smooth(mi.Float(gain.astype(np.float32))).numpy()
-
-
-def _shown(judge: Judge, template: Mesh, solid: np.ndarray, logits: np.ndarray, closed: Shown) -> Shown:
-    """The part of a template that is solid, its rims where the logits have them."""
-    vertices, faces = template
-    part = positive_part(vertices, faces, np.where(solid, np.abs(logits), -np.abs(logits)))
-    return judge.shown(part, like=closed)

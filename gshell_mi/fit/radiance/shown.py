@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -16,7 +17,7 @@ from ...views import PinholeViews
 from .mirrored import Mirrored, mirrored_direction
 
 #: Batches of rays that tell the colours.
-_BATCHES = 40
+BATCHES = 40
 
 #: Batches, of these, that tell what is mirrored: a few numbers for all of the surface.
 _MIRRORED_BATCHES = 10
@@ -25,7 +26,7 @@ _MIRRORED_BATCHES = 10
 _ROUNDS = 2
 
 #: Lambda that spreads colours along a mesh to vertices that hardly a ray comes near.
-_SMOOTHING = 0.5
+COLOR_SMOOTHING = 0.5
 
 #: Vertices (V, 3) and faces (F, 3).
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -63,10 +64,20 @@ class Met:
     mirrored: mi.Vector3f
     hit: mi.Bool
 
+    @classmethod
+    def nothing(cls) -> Met:
+        """One ray that meets nothing."""
+        return cls([mi.UInt32(0)] * 3, [mi.Float(0)] * 3, mi.Vector3f(0, 0, 1), mi.Bool(False))
+
     def interpolate(self, colors: mi.Float) -> mi.Color3f:
         """Colours of the sides of vertices at the hits."""
         return sum((weight * dr.gather(mi.Color3f, colors, vertex, self.hit)
                     for vertex, weight in zip(self.vertices, self.weights, strict=True)), mi.Color3f(0))
+
+    def values_at(self, values: mi.Float) -> mi.Float:
+        """One value per vertex, whichever its side, at the hits."""
+        return sum((weight * dr.gather(mi.Float, values, vertex >> 1, self.hit)
+                    for vertex, weight in zip(self.vertices, self.weights, strict=True)), mi.Float(0))
 
     def at(self, lane: mi.UInt32) -> Met:
         """The same on some lanes."""
@@ -96,7 +107,7 @@ class Shown:
         self._scene, self._corners = mesh_scene(vertices, faces), mi.UInt32(faces.astype(np.uint32).ravel())
         self._normals = vertex_normals(mi.Float(np.ascontiguousarray(vertices, np.float32).ravel()),
                                        mi.Vector3u(np.ascontiguousarray(faces.T, np.uint32)))
-        self._count, self._smooth = len(vertices), MeshDiffusion(faces, len(vertices), _SMOOTHING)
+        self._smooth = MeshDiffusion(faces, len(vertices), COLOR_SMOOTHING)
         with dr.suspend_grad():
             self.looks = [self._look(views, pool, batch, seed, like.looks[index].mirrored if like else None)
                           for index, pool in enumerate(pools)]
@@ -117,7 +128,7 @@ class Shown:
     def _look(self, views: PinholeViews, pool: PixelPool, batch: int, seed: int,
               known: Mirrored | None) -> Look:
         seen = []
-        for step in range(_BATCHES):
+        for step in range(BATCHES):
             sample = pool.sample(batch, seed=seed, step=step)
             met = self._met(views.rays(sample.view, sample.film))
             lane = dr.compress(met.hit & (sample.alpha > COVERED))
@@ -126,30 +137,12 @@ class Shown:
             seen.append((met.at(lane), dr.gather(mi.Color3f, sample.radiance, lane)))
             dr.eval(seen[-1])
         mirrored = known or Mirrored.nothing()
-        colors = self._colors(seen, mirrored)
+        colors = mean_colors(seen, mirrored, self._smooth)
         for _ in range(0 if known else _ROUNDS):
             mirrored = mirrored.improved([(met.mirrored, radiance, met.interpolate(colors))
                                           for met, radiance in seen[:_MIRRORED_BATCHES]])
-            colors = self._colors(seen, mirrored)
+            colors = mean_colors(seen, mirrored, self._smooth)
         return Look(colors, mirrored)
-
-    def _colors(self, seen: list[tuple[Met, mi.Color3f]], mirrored: Mirrored) -> mi.Float:
-        """(2 V * 3) mean colour of each vertex' sides."""
-        sums = [dr.zeros(mi.Float, 2 * self._count) for _ in range(4)]
-        for met, radiance in seen:
-            values = (*(radiance / mirrored.factor(met.mirrored)), mi.Float(1))
-            for vertex, weight in zip(met.vertices, met.weights, strict=True):
-                for total, value in zip(sums, values, strict=True):
-                    dr.scatter_reduce(dr.ReduceOp.Add, total, weight * value, vertex)
-            dr.eval(sums)
-        side = 2 * dr.arange(mi.UInt32, self._count)
-        colors = dr.zeros(mi.Float, 6 * self._count)
-        for back in range(2):
-            *color, weight = (dr.maximum(self._smooth(dr.gather(mi.Float, total, side + back)), 0)
-                              for total in sums)
-            dr.scatter(colors, mi.Color3f(*color) / dr.maximum(weight, 1e-6), side + back)
-        dr.eval(colors)
-        return colors
 
     def _met(self, ray: mi.Ray3f) -> Met:
         found = self._scene.ray_intersect_preliminary(ray, coherent=False)
@@ -163,3 +156,30 @@ class Shown:
             normal += weight * dr.gather(mi.Vector3f, self._normals, vertex, hit)
             vertices.append(2 * vertex + dr.select(back, mi.UInt32(1), 0))
         return Met(vertices, weights, mirrored_direction(dr.normalize(ray.d), normal), hit)
+
+
+def mean_colors(seen: Iterable[tuple[Met, mi.Color3f]], mirrored: Mirrored,
+                smooth: MeshDiffusion) -> mi.Float:
+    """(2 V * 3) mean colour of each vertex' sides.
+
+    Args:
+        seen: hits and the radiance that images show there.
+        mirrored: factor of that.
+        smooth: along the mesh.
+    """
+    sums = [dr.zeros(mi.Float, 2 * smooth.count) for _ in range(4)]
+    for met, radiance in seen:
+        values = (*(radiance / mirrored.factor(met.mirrored)), mi.Float(1))
+        for vertex, weight in zip(met.vertices, met.weights, strict=True):
+            for total, value in zip(sums, values, strict=True):
+                dr.scatter_reduce(dr.ReduceOp.Add, total, weight * value, vertex, met.hit)
+        dr.eval(sums)
+    side = 2 * dr.arange(mi.UInt32, smooth.count)
+    diffused = smooth.together({f"{back} {index}": dr.gather(mi.Float, total, side + back)
+                                for back in range(2) for index, total in enumerate(sums)})
+    colors = dr.zeros(mi.Float, 6 * smooth.count)
+    for back in range(2):
+        *color, weight = (dr.maximum(diffused[f"{back} {index}"], 0) for index in range(4))
+        dr.scatter(colors, mi.Color3f(*color) / dr.maximum(weight, 1e-6), side + back)
+    dr.eval(colors)
+    return colors

@@ -28,7 +28,7 @@ from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from ..judge import Judge
 from ..radiance.acceptance import close_rejected, close_shallow, open_rejected
-from ..radiance.shown import Mesh, Shown
+from ..radiance.parts import Parts
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
 from ..stage import Fit
@@ -91,7 +91,8 @@ class Openings:
             if not fit.config.watertight:
                 min_area = fit.config.topology.min_area
                 thickness, _ = opposite_sides(template.start, template.start, faces, fit.cell(surface))
-                logits = find_openings(appearance, template.closed, fit.judge, closed, self.config.rounds,
+                parts = fit.judge.parts(template.closed, closed)
+                logits = find_openings(appearance, parts, fit.judge, self.config.rounds,
                                        lambda logits: close_shallow(
                                            clean_opacity(logits, vertices, faces, min_area), faces,
                                            np.isfinite(thickness)),
@@ -169,15 +170,14 @@ def justified(smoothed: np.ndarray, logits: np.ndarray, clean: Callable[[np.ndar
     return logits
 
 
-def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, closed: Shown, rounds: int,
+def find_openings(appearance: SurfaceRadiance, parts: Parts, judge: Judge, rounds: int,
                   clean: Callable[[np.ndarray], np.ndarray], train: Callable[[int], None]) -> np.ndarray:
     """Where the images justify an opening.
 
     Args:
         appearance: after its training; it is trained further.
-        template: the mesh that it is on.
+        parts: of the template that it is on.
         judge: of the fit.
-        closed: the template as the judge shows it.
         rounds: in which it is trained again, at most.
         clean: undoes what cannot be meant in (V,) logits: cuts and islands that are too small, as
             ``clean_opacity`` does, and cuts as of ``close_shallow``.
@@ -186,7 +186,7 @@ def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, clo
     Returns:
         (V,) opacity logits, negative at openings.
     """
-    opened, unjustified = (np.zeros(len(template[0]), bool) for _ in range(2))
+    opened, unjustified = (np.zeros(appearance.vertex_count, bool) for _ in range(2))
     for trained_again in range(rounds + 1):
         if trained_again:
             appearance.begin_again(unjustified, opened)
@@ -195,7 +195,7 @@ def find_openings(appearance: SurfaceRadiance, template: Mesh, judge: Judge, clo
         proposed = clean(np.where(opened, np.minimum(smoothed, _OPEN), smoothed))
         logits = np.where(opened, _OPEN, np.abs(smoothed))
         logits = clean(justified(smoothed, logits, clean, lambda candidate: open_rejected(
-            clean(close_rejected(candidate, template, judge, closed)), template, judge, closed)))
+            clean(close_rejected(candidate, parts, judge, parts.all)), parts, judge)))
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
         unjustified |= (proposed <= 0) & (logits > 0)

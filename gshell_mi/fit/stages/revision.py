@@ -20,9 +20,9 @@ from ...template.msdf import clean_opacity, reopened, rewritten
 from ...template.sides import opposite_sides
 from ...topology import lobes
 from ...triangles import positive_part
-from ..judge import places_of
+from ..judge import Judge, places_of
 from ..radiance.acceptance import WORST, close_rejected, close_shallow
-from ..radiance.shown import Mesh
+from ..radiance.parts import Parts
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
 from ..stage import Fit
@@ -53,18 +53,23 @@ class Revision:
         template = fit.scene.subject.surface_of(fields, template=True)
         vertices, faces, _ = template.to_numpy()
         values = template.interpolate(mi.Float(fields.msdf)).numpy() / lattice.spacing
-        mirrored = fit.judge.shown(positive_part(vertices, faces, values)).mirrored
+        now = fit.judge.shown(positive_part(vertices, faces, values))
         appearance = SurfaceRadiance(vertices, faces, fit.views, fit.pixels, fit.config.radiance,
-                                     seed=fit.config.seed, mirrored=mirrored)
+                                     seed=fit.config.seed, mirrored=now.mirrored)
         steps.run(OpacityTraining(appearance, self.config), self.config.iterations,
                   {"radiance": appearance.optimizer})
         with steps.task("verdict"):
             proposed = appearance.smoothed_logits()
             thickness, opposite = opposite_sides(vertices, vertices, faces, cell)
             thin = np.isfinite(thickness)
-            revised, capped, moved = _closed(fit, (vertices, faces), values, np.where(thin, opposite, -1))
-            revised = _with_islands(fit, (moved, faces), revised, proposed)
-            revised = _opened(fit, (moved, faces), revised, proposed, thin)
+            smooth = least_bent(vertices, faces, (values <= 0) & ~thin)
+            revised = _closed(fit.judge, fit.judge.parts((smooth, faces), now), values,
+                              np.where(thin, opposite, -1))
+            capped = (values <= 0) & (revised > 0)
+            moved = np.where(capped[:, None], smooth, vertices)
+            parts = fit.judge.parts((moved, faces), now)
+            revised = _with_islands(fit.judge, parts, revised, proposed)
+            revised = _opened(fit, parts, revised, proposed, thin)
             revised = clean_opacity(revised, moved, faces, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
         steps.fact("openings_changed", bool(changed.any()))
@@ -83,8 +88,7 @@ class Revision:
         return replace(surface.with_fields(sdf=sdf, msdf=msdf), settled=False)
 
 
-def _closed(fit: Fit, template: Mesh, values: np.ndarray,
-            opposite: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _closed(judge: Judge, parts: Parts, values: np.ndarray, opposite: np.ndarray) -> np.ndarray:
     """Closes openings that explain unseen views no better than caps that go on as their surroundings do.
 
     Nothing has shaped the caps so far, and a hull's bulge explains too little to stand for a surface. Through
@@ -93,22 +97,21 @@ def _closed(fit: Fit, template: Mesh, values: np.ndarray,
     looks alike.
 
     Args:
-        fit, template, values: as of ``_opened``.
+        judge: of the fit.
+        parts: of the template with such caps.
+        values: (V,) negative at its openings.
         opposite: (V,) vertex on the template's other side, -1 if that is not near.
 
     Returns:
-        (V,) values, those of closed openings negated; (V,) which are; and (V, 3) where the vertices are then.
+        (V,) values, those of closed openings negated.
     """
-    (vertices, faces), thin, opened = template, opposite >= 0, values <= 0
-    smooth, positions = least_bent(vertices, faces, opened & ~thin), vertices
+    thin = opposite >= 0
     for closing in reversed(range(_CLOSINGS)):
         chosen = values <= 0
         if not chosen.any():
             break
-        place = places_of(chosen, lobes(chosen, faces))
-        now = fit.judge.shown(positive_part(positions, faces, values))
-        whole = fit.judge.shown((smooth, faces), like=now)
-        verdict = fit.judge.compare(now, whole, (template, place))
+        place = places_of(chosen, lobes(chosen, parts.faces))
+        verdict = judge.compare_parts(parts.of(values), parts.all, place)
         backed = thin & (values[opposite] > 0)
         alone = 2 * np.bincount(place[chosen], backed[chosen]) <= np.bincount(place[chosen])
         gain = np.where(np.isfinite(verdict.noise) & alone, verdict.gain, 0)
@@ -116,19 +119,16 @@ def _closed(fit: Fit, template: Mesh, values: np.ndarray,
             break
         rejected = gain == gain.max() if closing else gain > 0
         values = np.where(chosen & rejected[place], -values, values)
-        positions = np.where((opened & (values > 0))[:, None], smooth, vertices)
-    return values, opened & (values > 0), positions
+    return values
 
 
-def _with_islands(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.ndarray) -> np.ndarray:
+def _with_islands(judge: Judge, parts: Parts, values: np.ndarray, proposed: np.ndarray) -> np.ndarray:
     """(V,) values, those in openings negated where the radiance shows something opaque that explains unseen
     views better, such as an island."""
     while (chosen := (values <= 0) & (proposed > 0)).any():
-        place = places_of(chosen, lobes(chosen, template[1]))
-        now = fit.judge.shown(positive_part(*template, values))
-        solid = np.where(chosen, np.abs(values), values)
-        after = fit.judge.shown(positive_part(*template, solid), like=now)
-        verdict = fit.judge.compare(now, after, (template, place))
+        place = places_of(chosen, lobes(chosen, parts.faces))
+        after = parts.of(np.where(chosen, np.abs(values), values))
+        verdict = judge.compare_parts(parts.of(values), after, place)
         gain = np.where(verdict.accepted, verdict.gain, 0)
         if not gain.any():
             break
@@ -136,20 +136,18 @@ def _with_islands(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.nda
     return values
 
 
-def _opened(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.ndarray,
-            thin: np.ndarray) -> np.ndarray:
+def _opened(fit: Fit, parts: Parts, values: np.ndarray, proposed: np.ndarray, thin: np.ndarray) -> np.ndarray:
     """(V,) values, negative also where unseen views are explained better without the surface.
 
     Args:
         fit: the views.
-        template: vertices and faces.
+        parts: of the template.
         values: (V,) negative at its openings.
         proposed: (V,) opacity logits.
         thin: (V,) where the template's other side is within two cells.
     """
-    vertices, faces = template
-    given = values <= 0
-    now = fit.judge.shown(positive_part(vertices, faces, values))
+    vertices, faces = parts.template.mesh
+    given, now = values <= 0, parts.of(values)
 
     def clean(logits: np.ndarray) -> np.ndarray:
         both = np.where(given, values, logits)
@@ -158,4 +156,4 @@ def _opened(fit: Fit, template: Mesh, values: np.ndarray, proposed: np.ndarray,
 
     start = np.where(given, values, np.abs(proposed))
     return justified(proposed, start, clean, lambda candidate: close_rejected(
-        candidate, template, fit.judge, now, given))
+        candidate, parts, fit.judge, now, given))

@@ -174,8 +174,9 @@ def test_a_missing_array_is_the_files_fault(tmp_path):
         loaded.arrays["hull"]
 
 
-def test_an_optimizer_of_another_size(tmp_path):
-    arrays = optimizer_arrays("shading", adam(False)) | {"shading/a/value": np.zeros(4, np.float32)}
+@pytest.mark.parametrize(("part", "size"), [("value", 4), ("first", 1), ("second", 0), ("step", 2)])
+def test_an_optimizer_of_another_size(part, size):
+    arrays = optimizer_arrays("shading", adam(False)) | {f"shading/a/{part}": np.zeros(size, np.float32)}
     with pytest.raises(UserError, match="'shading/a' has another size than this fit needs"):
         restore_optimizer("shading", adam(False), arrays)
 

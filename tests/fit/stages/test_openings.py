@@ -21,6 +21,8 @@ class ScriptedRadiance:
     Through ``false`` the images are explained worse, through all others better.
     """
 
+    vertex_count = len(VERTICES)
+
     def __init__(self, first: tuple, false: tuple, behind: tuple):
         self.false, self.behind = (np.logical_or.reduce([self.cap(axis) for axis in axes], initial=False)
                                    for axes in (false, behind))
@@ -52,8 +54,7 @@ class ScriptedRadiance:
 def found_openings(appearance: ScriptedRadiance, rounds: int = 3) -> np.ndarray:
     clean = partial(clean_opacity, vertices=VERTICES, faces=FACES, min_area=0.005)
     judge = ScriptedJudge(len(VERTICES), appearance.error)
-    template = VERTICES, FACES
-    return find_openings(appearance, template, judge, judge.shown(template), rounds, clean,
+    return find_openings(appearance, judge.parts((VERTICES, FACES)), judge, rounds, clean,
                          appearance.train) <= 0
 
 
