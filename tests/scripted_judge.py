@@ -20,11 +20,11 @@ class ScriptedJudge:
         self.count, self.error, self.noise = count, error, noise
         self.asked: list[np.ndarray] = []
 
-    def parts(self, template: Mesh) -> "ScriptedParts":
-        """Of the template."""
-        return ScriptedParts(template[1], self)
+    def shown(self, mesh: Mesh) -> "ScriptedTemplate":
+        """The template."""
+        return ScriptedTemplate(mesh, self)
 
-    def compare_parts(self, before: np.ndarray, after: np.ndarray, label: np.ndarray) -> Verdict:
+    def compare(self, before: np.ndarray, after: np.ndarray, label: np.ndarray) -> Verdict:
         """By the mean errors of each place's vertices."""
         told = label >= 0
         number = np.maximum(np.bincount(label[told]), 1)
@@ -34,14 +34,14 @@ class ScriptedJudge:
         return Verdict(first, second, gain, np.full(len(gain), self.noise))
 
 
-class ScriptedParts:
-    """Parts of a template are (V,) which of its vertices are opaque."""
+class ScriptedTemplate:
+    """A part of it is (V,) which of its vertices are opaque."""
 
-    def __init__(self, faces: np.ndarray, judge: ScriptedJudge):
-        self.faces, self._judge = faces, judge
-        self.all = self.of(np.ones(judge.count))
+    def __init__(self, mesh: Mesh, judge: ScriptedJudge):
+        self.mesh, self._judge = mesh, judge
+        self.whole = self.part(np.ones(judge.count))
 
-    def of(self, values: np.ndarray) -> np.ndarray:
+    def part(self, values: np.ndarray) -> np.ndarray:
         """What is positive."""
         self._judge.asked.append(values > 0)
         return values > 0

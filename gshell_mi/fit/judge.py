@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,26 +10,24 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..compat import mesh_scene
 from ..pixels import PixelPool, PixelSample
 from ..targets import Target
 from ..views import PinholeViews
 from .radiance.contrast import Contrast
 from .radiance.lanes import chosen_lanes
-from .radiance.parts import Part, Parts, TracedMesh
-from .radiance.shown import Mesh, Shown
+from .radiance.shown import JUDGING, Mesh, Met, Part, Shown
 
 #: Pixels this near to a mask's outline do not judge: where a surface ends to a cell is found later.
 _OUTLINE = 3
-
-#: Batches of rays that judge.
-_JUDGED = 20
 
 #: Standard errors by which a change has to be better.
 _SURE = 2.0
 
 #: Errors of this size are none.
 _EXACT = 1e-3
+
+#: Logarithms of errors that are sums in single precision are equal up to this.
+_ROUNDED = 1e-6
 
 #: Views that have to tell of a place before their spread does.
 _VIEWS = 4
@@ -96,64 +95,49 @@ class Judge:
 
     def shown(self, mesh: Mesh, like: Shown | None = None) -> Shown:
         """A mesh as the images show it, once for each of the splits; it may mirror what another one does."""
-        return Shown(mesh, self.views, [known for known, _ in self._pools], batch=self.batch, seed=self.seed,
-                     like=like)
+        return Shown(mesh, self.views, self._pools, batch=self.batch, seed=self.seed, like=like)
 
-    def compare(self, before: Shown, after: Shown, places: tuple[Mesh, np.ndarray] | None = None) -> Verdict:
+    def compare(self, before: Part, after: Part, label: np.ndarray | None = None,
+                where: Shown | None = None) -> Verdict:
         """Judges a change.
 
         Args:
             before, after: the surface without and with the change.
-            places: a mesh and (V,) which change its vertices tell of, from 0; -1 where of none. A ray judges
+            label: (V,) which change the vertices of a mesh tell of, from 0; -1 where of none. A ray judges
                 the change at the vertex that it meets first. Default: all rays judge one change.
+            where: that mesh; default: what ``before`` is a part of.
         """
-        mesh, label = places or (None, np.zeros(1, np.int32))
-        where = mesh and mesh_scene(*mesh)
-        corners = mi.UInt32(mesh[1].astype(np.uint32).ravel()) if mesh else None
-        sums = _Sums(label, len(self.views))
+        places, views = 1 if label is None else max(int(label.max()) + 1, 1), len(self.views)
+        most, sums = dr.opaque(mi.UInt32, views), [dr.zeros(mi.Float, places * views) for _ in range(3)]
         with dr.suspend_grad():
-            for split, (_, pixels) in enumerate(self._pools):
-                for step in range(_JUDGED):
-                    sample = pixels.sample(self.batch, seed=self.seed, step=step)
-                    vertex, met = dr.zeros(mi.UInt32, dr.width(sample.view)), mi.Bool(True)
-                    if where:
-                        hit = where.ray_intersect_preliminary(self._rays(sample), coherent=False)
-                        dr.eval(hit)
-                        met = hit.is_valid()
-                        vertex = dr.gather(mi.UInt32, corners, 3 * hit.prim_index, met)
-                    lane = sums.told(vertex, met)
-                    if not dr.width(lane):
-                        continue
-                    sample, ray = sample.at(lane), self._rays(sample.at(lane))
-                    errors = [self._error(split, sample, *shown.look(ray, split))
-                              for shown in (before, after)]
-                    sums.add(dr.gather(mi.UInt32, vertex, lane), sample.view, errors)
-        return sums.verdict()
+            for split in range(len(self.splits)):
+                for pixel, place, first in self._judging(split, label, where or before.shown):
+                    errors = [self._error(split, pixel, *part.look(
+                        pixel, split, first if part.shown is (where or before.shown) else None))
+                        for part in (before, after)]
+                    for total, value in zip(sums, (mi.Float(1), *errors), strict=True):
+                        dr.scatter_reduce(dr.ReduceOp.Add, total, value, place * most + pixel.view)
+                    dr.eval(sums)
+        return verdict_of(*(total.numpy().reshape(-1, views) for total in sums))
 
-    def parts(self, template: Mesh, like: Shown) -> Parts:
-        """Parts of a template, which mirror what something else of the surface does."""
-        return Parts(TracedMesh(template, self.views), self._pools, [look.mirrored for look in like.looks],
-                     batch=self.batch, judged=_JUDGED, seed=self.seed)
+    def decide(self, before: Mesh, after: Mesh) -> Verdict:
+        """Judges one change of the whole surface."""
+        return self.compare(self.shown(before).whole, self.shown(after).whole)
 
-    def compare_parts(self, before: Part, after: Part, label: np.ndarray) -> Verdict:
-        """Judges a change of what there is of a template.
-
-        Args:
-            before, after: parts of the same template.
-            label: (V,) as of ``compare``, of the template.
-        """
-        sums = _Sums(label, len(self.views))
-        with dr.suspend_grad():
-            for split, rays in enumerate(before.parts.judging):
-                vertex = rays.met.vertices[0] >> 1
-                lane = sums.told(vertex, rays.met.hit)
-                if not dr.width(lane):
-                    continue
-                some = rays.at(lane)
-                was = [dr.gather(type(value), value, lane) for value in before.looks[split]]
-                errors = [self._error(split, some.pixel, *look) for look in (was, after.look(some, split))]
-                sums.add(dr.gather(mi.UInt32, vertex, lane), some.pixel.view, errors)
-        return sums.verdict()
+    def _judging(self, split: int, label: np.ndarray | None,
+                 where: Shown) -> Iterator[tuple[PixelSample, mi.UInt32, Met | None]]:
+        """Pixels that judge, the place that they judge, and where their rays meet a mesh first if that tells
+        which it is."""
+        if label is None:
+            for step in range(JUDGING):
+                pixel = self._pools[split][1].sample(self.batch, seed=self.seed, step=step)
+                yield pixel, dr.zeros(mi.UInt32, dr.width(pixel.view)), None
+            return
+        rays = where.judging[split]
+        place = dr.gather(mi.Int32, mi.Int32(label.astype(np.int32)), rays.met.vertices[0] >> 1, rays.met.hit)
+        lane = chosen_lanes(rays.met.hit & (place >= 0), place)
+        if dr.width(lane):
+            yield rays.pixel.at(lane), mi.UInt32(dr.gather(mi.Int32, place, lane)), rays.met.at(lane)
 
     def _error(self, split: int, sample: PixelSample, radiance: mi.Color3f, alpha: mi.Float) -> mi.Float:
         """How badly what is seen explains each of some pixels."""
@@ -163,42 +147,6 @@ class Judge:
         coverage = dr.opaque(mi.Float, 3 * pixels.mask_weight(1.0) if pixels.has_alpha else 3.0)
         error = dr.abs(tone(radiance) - tone(sample.radiance))
         return dr.sum(error) + coverage * dr.abs(alpha - sample.alpha)
-
-    def decide(self, before: Mesh, after: Mesh) -> Verdict:
-        """Judges one change of the whole surface."""
-        return self.compare(self.shown(before), self.shown(after))
-
-    def _rays(self, sample: PixelSample) -> mi.Ray3f:
-        return self.views.rays(sample.view, sample.film)
-
-
-class _Sums:
-    """Errors before and after, added up for each place and view.
-
-    Args:
-        label: (V,) which place a vertex belongs to; -1 if none.
-        views: their number.
-    """
-
-    def __init__(self, label: np.ndarray, views: int):
-        self._views, self._most = views, dr.opaque(mi.UInt32, views)
-        self._labels = mi.Int32(label.astype(np.int32))
-        self._sums = [dr.zeros(mi.Float, max(int(label.max()) + 1, 1) * views) for _ in range(3)]
-
-    def told(self, vertex: mi.UInt32, met: mi.Bool) -> mi.UInt32:
-        """Lanes of rays that tell of a place, by the vertex that they meet."""
-        return chosen_lanes(met & (dr.gather(mi.Int32, self._labels, vertex, met) >= 0), vertex)
-
-    def add(self, vertex: mi.UInt32, view: mi.UInt32, errors: list[mi.Float]) -> None:
-        """Adds rays that tell."""
-        lane = mi.UInt32(dr.gather(mi.Int32, self._labels, vertex)) * self._most + view
-        for total, value in zip(self._sums, (mi.Float(1), *errors), strict=True):
-            dr.scatter_reduce(dr.ReduceOp.Add, total, value, lane)
-        dr.eval(self._sums)
-
-    def verdict(self) -> Verdict:
-        """Of all that was added."""
-        return verdict_of(*(total.numpy().reshape(-1, self._views) for total in self._sums))
 
 
 def places_of(chosen: np.ndarray, patch: np.ndarray) -> np.ndarray:
@@ -223,7 +171,7 @@ def verdict_of(rays: np.ndarray, before: np.ndarray, after: np.ndarray) -> Verdi
     voices = np.maximum(weight.sum(axis=1), 1e-12)
     gain = (weight * change).sum(axis=1) / voices
     spread = (weight**2 * (change - gain[:, None]) ** 2).sum(axis=1)
-    noise = np.sqrt(spread * seen / np.maximum(seen - 1, 1)) / voices
+    noise = np.sqrt(spread * seen / np.maximum(seen - 1, 1)) / voices + _ROUNDED
     noise[seen < _VIEWS] = np.inf
     per_ray = np.maximum(total, 1)
     return Verdict(before.sum(axis=1) / per_ray, after.sum(axis=1) / per_ray, gain, noise)

@@ -71,7 +71,8 @@ def test_each_place_is_judged_by_the_rays_that_meet_it_first(scene):
     closed, opened = _with_lid(), _bowl()
     lid = np.arange(len(closed[0])) >= len(opened[0])
     place = np.where(lid, 0, np.where(closed[0][:, 1] < -0.4 * RADIUS, 1, -1))
-    verdict = judge.compare(judge.shown(closed), judge.shown(opened), (closed, place))
+    lid_on = judge.shown(closed)
+    verdict = judge.compare(lid_on.whole, judge.shown(opened).whole, place)
     assert verdict.accepted.tolist() == [True, False]
     assert verdict.after[0] < 0.85 * verdict.before[0]
     assert verdict.gain[1] == pytest.approx(0, abs=0.05)

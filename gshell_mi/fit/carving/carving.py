@@ -71,8 +71,8 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
     if not fit.config.watertight:
         # Now that what lies behind is in its place, the images may justify more openings.
         proposed = clean(np.where(_in_empty_space(after, volume, opacity, seen), -_CERTAIN, cleaned))
-        parts = fit.judge.parts(after.closed, fit.judge.shown(after.closed))
-        justified = close_rejected(proposed, parts, fit.judge, parts.all)
+        closed = fit.judge.shown(after.closed)
+        justified = close_rejected(proposed, closed, fit.judge, closed.whole)
         # Those that there were have been judged, and a close call may come out otherwise now.
         cleaned = clean(np.where(cleaned > 0, justified, proposed))
     radiance = fitted_radiance(after, fit).radiance()[0]
@@ -98,8 +98,8 @@ def _kept(fit: Fit, before: Template, after: Template, label: np.ndarray,
     local = volume.to_lattice @ mi.Point3f(np.ascontiguousarray(before.vertices.T, np.float32))
     index = np.rint(((local + 1) * (0.5 * volume.resolution)).numpy()[::-1]).astype(int)
     place = label[tuple(np.clip(index, 0, len(label) - 1))] - 1
-    verdict = fit.judge.compare(fit.judge.shown(before.surface), fit.judge.shown(after.surface),
-                                (before.closed, place))
+    verdict = fit.judge.compare(fit.judge.shown(before.surface).whole, fit.judge.shown(after.surface).whole,
+                                place, fit.judge.shown(before.closed))
     kept = np.zeros(label.max(), bool)
     kept[: len(verdict.accepted)] = verdict.accepted[: len(kept)]
     return kept

@@ -105,7 +105,7 @@ class _Trials:
 
     def __init__(self, fit: Fit, surface: Surface, template: Template):
         self.fit, self.surface, self.template = fit, surface, template
-        self.lattice = surface.lattice
+        self.lattice, self._closed = surface.lattice, fit.judge.shown(template.closed)
         points = mi.Transform4f(fit.scene.subject.to_world) @ self.lattice.points(mi.Float)
         self._inside = surface.hull < 0
         self._points = points.numpy().T[self._inside]
@@ -118,8 +118,8 @@ class _Trials:
             return None
         space = first.hollow.space
         place = np.where(opened, space, -1)
-        verdict = self.fit.judge.compare(self.fit.judge.shown(self.template.surface), first.shown,
-                                         (self.template.closed, place))
+        before = self.fit.judge.shown(self.template.surface)
+        verdict = self.fit.judge.compare(before.whole, first.shown.whole, place, self._closed)
         hollow = np.append(verdict.accepted, False)
         mouth = opened & hollow[place]
         if not mouth.any():
@@ -139,8 +139,8 @@ class _Trials:
         for thickness, depth in others:
             mouth = best.hollow.mouth
             other = self._vessel(mouth, thickness, depth)
-            places = self.template.closed, np.where(mouth, 0, -1)
-            if other is None or not self.fit.judge.compare(best.shown, other.shown, places).accepted[0]:
+            if other is None or not self.fit.judge.compare(
+                    best.shown.whole, other.shown.whole, np.where(mouth, 0, -1), self._closed).accepted[0]:
                 break
             best = other
         return best

@@ -8,7 +8,7 @@ import numpy as np
 from ...fields.smoothing import MeshDiffusion
 from ...topology import equal_patches, lobes, patch_sizes, vertex_components
 from ..judge import Judge, places_of
-from .parts import Part, Parts
+from .shown import Part, Shown
 
 #: Rounds in which openings are closed; in the last one all that are rejected.
 _CLOSINGS = 7
@@ -44,7 +44,7 @@ def close_shallow(logits: np.ndarray, faces: np.ndarray, thin: np.ndarray) -> np
     return np.where(opened & shallow[patch], -logits, logits)
 
 
-def close_rejected(logits: np.ndarray, parts: Parts, judge: Judge, before: Part,
+def close_rejected(logits: np.ndarray, template: Shown, judge: Judge, before: Part,
                    given: np.ndarray | None = None) -> np.ndarray:
     """Closes the openings through which unseen views are not explained better than without them.
 
@@ -57,7 +57,7 @@ def close_rejected(logits: np.ndarray, parts: Parts, judge: Judge, before: Part,
 
     Args:
         logits: (V,) opacity logits; surface where positive.
-        parts: of the template.
+        template: what is opened, closed.
         judge: of the fit.
         before: the template without these openings.
         given: (V,) openings that have been justified; default: none.
@@ -65,7 +65,7 @@ def close_rejected(logits: np.ndarray, parts: Parts, judge: Judge, before: Part,
     Returns:
         (V,) logits, those of rejected openings negated.
     """
-    faces = parts.faces
+    faces = template.mesh[1]
     given = np.zeros(len(logits), bool) if given is None else given
     opened = (logits <= 0) & ~given
     if not opened.any():
@@ -76,8 +76,8 @@ def close_rejected(logits: np.ndarray, parts: Parts, judge: Judge, before: Part,
     kept, trimmed = opened, np.zeros_like(opened)
     for closing in reversed(range(_CLOSINGS)):
         place = places_of(kept, lobes(kept, faces))
-        after = parts.of(np.where(kept | given, -np.abs(logits), np.abs(logits)))
-        verdict = judge.compare_parts(before, after, place)
+        after = template.part(np.where(kept | given, -np.abs(logits), np.abs(logits)))
+        verdict = judge.compare(before, after, place)
         worst = ~verdict.accepted
         # The worst first; all where none is worse but some are not surely better, and in the last round.
         if closing:
@@ -101,18 +101,18 @@ def close_rejected(logits: np.ndarray, parts: Parts, judge: Judge, before: Part,
     return np.where(opened & ~kept, -logits, logits)
 
 
-def open_rejected(logits: np.ndarray, parts: Parts, judge: Judge) -> np.ndarray:
+def open_rejected(logits: np.ndarray, template: Shown, judge: Judge) -> np.ndarray:
     """Opens the islands in openings that unseen views do not speak for.
 
     A highlight on the inside of a bowl may be explained by a piece of the lid.
 
     Args:
-        logits, parts, judge: as of ``close_rejected``.
+        logits, template, judge: as of ``close_rejected``.
 
     Returns:
         (V,) logits, those of rejected islands negated.
     """
-    faces = parts.faces
+    faces = template.mesh[1]
     solid = logits > 0
     patch = equal_patches(solid, faces)
     piece = vertex_components(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(logits))[1]
@@ -121,9 +121,9 @@ def open_rejected(logits: np.ndarray, parts: Parts, judge: Judge) -> np.ndarray:
     if not island.any():
         return logits
     place = places_of(island, patch)
-    without, present = (parts.of(np.where(chosen, np.abs(logits), -np.abs(logits)))
+    without, present = (template.part(np.where(chosen, np.abs(logits), -np.abs(logits)))
                         for chosen in (solid & ~island, solid))
-    accepted = judge.compare_parts(without, present, place).accepted
+    accepted = judge.compare(without, present, place).accepted
     return np.where(island & ~accepted[place], -logits, logits)
 
 
@@ -131,6 +131,6 @@ def _gains(judge: Judge, faces: np.ndarray, before: Part, after: Part, chosen: n
     """(V,) what each ``chosen`` vertex tells of a change, smoothed along the template; up to a factor."""
     count = len(chosen)
     place = places_of(chosen, np.arange(count))
-    gain = np.where(chosen, judge.compare_parts(before, after, place).gain[place], 0)
+    gain = np.where(chosen, judge.compare(before, after, place).gain[place], 0)
     smooth = MeshDiffusion(faces, count, _SMOOTHING)
     return smooth(mi.Float(gain.astype(np.float32))).numpy()

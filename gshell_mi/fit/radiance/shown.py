@@ -1,9 +1,15 @@
-"""A mesh in the mean colours that images show it in, but for what all of it mirrors."""
+"""A mesh, or parts of it, in the mean colours that images show it in, but for what all of it mirrors.
+
+Openings are proposed by the dozen on one template, and most of what is seen is the same with and without each
+of them. So where rays meet the mesh first is found once, and kept with the pixels that they are of. Of a part
+of it only the rays through what is open are followed any further.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -11,22 +17,27 @@ import numpy as np
 
 from ...compat import mesh_scene
 from ...fields.smoothing import MeshDiffusion
-from ...pixels import COVERED, PixelPool
+from ...pixels import COVERED, PixelPool, PixelSample
 from ...template.normals import vertex_normals
 from ...views import PinholeViews
+from .lanes import chosen_lanes, joined_lanes
+from .layers import Sheet, trace_layers
 from .mirrored import Mirrored, mirrored_direction
 
-#: Batches of rays that tell the colours.
-BATCHES = 40
+#: Batches of rays that tell the colours, and of rays that judge.
+_TELLING, JUDGING = 40, 20
 
-#: Batches, of these, that tell what is mirrored: a few numbers for all of the surface.
-_MIRRORED_BATCHES = 10
+#: Share of the rays that tell which tells what is mirrored: a few numbers for all of the surface.
+_MIRRORED_SHARE = 0.25
 
 #: How often, in turn, colours are told what is mirrored and the other way round.
 _ROUNDS = 2
 
 #: Lambda that spreads colours along a mesh to vertices that hardly a ray comes near.
-COLOR_SMOOTHING = 0.5
+_SMOOTHING = 0.5
+
+#: Sheets of the mesh that a ray may pass.
+_SHEETS = 8
 
 #: Vertices (V, 3) and faces (F, 3).
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -36,21 +47,8 @@ _NOTHING = np.zeros((3, 3)), np.array([[0, 1, 2]])
 
 
 @dataclass(frozen=True)
-class Look:
-    """How a mesh looks to some of the views.
-
-    Attributes:
-        colors: (2 V * 3), of the front and the back of each vertex.
-        mirrored: factor of these.
-    """
-
-    colors: mi.Float
-    mirrored: Mirrored
-
-
-@dataclass(frozen=True)
 class Met:
-    """What rays meet first of a mesh.
+    """Where rays meet a mesh.
 
     Attributes:
         vertices: three of each hit; even numbers from the front, odd ones from the back.
@@ -86,100 +84,197 @@ class Met:
                    dr.gather(mi.Vector3f, self.mirrored, lane), dr.gather(mi.Bool, self.hit, lane))
 
 
+@dataclass(frozen=True)
+class FirstHits:
+    """Rays that meet a mesh, one lane each.
+
+    Attributes:
+        pixel: that a ray goes through.
+        met: where it meets the mesh first.
+    """
+
+    pixel: PixelSample
+    met: Met
+
+    def at(self, lane: mi.UInt32) -> FirstHits:
+        """The same on some lanes."""
+        return FirstHits(self.pixel.at(lane), self.met.at(lane))
+
+
 class Shown:
     """A mesh as images show it.
 
     Args:
         mesh: vertices (V, 3) in world units, and faces (F, 3).
         views: the cameras.
-        pools: pixels that tell the colours; each has a look of its own.
+        pools: for each split of the views, the pixels that tell the colours, and those that judge.
         batch: pixels per batch of rays.
         seed: of the random pixels.
         like: mirrors the same, as another part of the same surface does; default: that is found, too.
-
-    Attributes:
-        looks: one for each of the pools.
     """
 
-    def __init__(self, mesh: Mesh, views: PinholeViews, pools: list[PixelPool], *, batch: int, seed: int,
-                 like: Shown | None = None):
+    def __init__(self, mesh: Mesh, views: PinholeViews, pools: list[tuple[PixelPool, PixelPool]], *,
+                 batch: int, seed: int, like: Shown | None = None):
+        self.mesh, self.views, self._pools, self._like = mesh, views, pools, like
+        self._batch, self._seed = batch, seed
         vertices, faces = mesh if len(mesh[1]) else _NOTHING
-        self._scene, self._corners = mesh_scene(vertices, faces), mi.UInt32(faces.astype(np.uint32).ravel())
-        self._normals = vertex_normals(mi.Float(np.ascontiguousarray(vertices, np.float32).ravel()),
-                                       mi.Vector3u(np.ascontiguousarray(faces.T, np.uint32)))
-        self._smooth = MeshDiffusion(faces, len(vertices), COLOR_SMOOTHING)
-        with dr.suspend_grad():
-            self.looks = [self._look(views, pool, batch, seed, like.looks[index].mirrored if like else None)
-                          for index, pool in enumerate(pools)]
+        self._scene = mesh_scene(vertices, faces)
+        self._positions = mi.Float(np.ascontiguousarray(vertices, np.float32).ravel())
+        self._faces = mi.Vector3u(np.ascontiguousarray(faces.T, np.uint32))
+        self._normals = vertex_normals(self._positions, self._faces)
+        self._offset = 1e-4 * float(np.ptp(vertices, axis=0).max())
+        self._smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
 
     @property
     def mirrored(self) -> Mirrored:
-        """What the surface mirrors, by all looks."""
-        return Mirrored.mean([look.mirrored for look in self.looks])
+        """What the surface mirrors, by all splits."""
+        return Mirrored.mean(self.mirrors)
 
-    def look(self, ray: mi.Ray3f, index: int) -> tuple[mi.Color3f, mi.Float]:
-        """Radiance and coverage along rays, in the look of that index."""
-        met, look = self._met(ray), self.looks[index]
-        radiance = met.interpolate(look.colors) * look.mirrored.factor(met.mirrored)
-        alpha = dr.select(met.hit, mi.Float(1), 0)
+    @cached_property
+    def mirrors(self) -> list[Mirrored]:
+        """What it mirrors, by each split."""
+        if self._like:
+            return self._like.mirrors
+        mirrors = []
+        for rays in self._telling:
+            mirrored, every = Mirrored.nothing(), dr.width(rays.pixel.view)
+            some = rays.at(dr.arange(mi.UInt32, max(int(_MIRRORED_SHARE * every), 1)))
+            for _ in range(_ROUNDS):
+                colors = self._mean_colors([(rays.met, rays.pixel.radiance)], mirrored)
+                mirrored = mirrored.improved([(some.met.mirrored, some.pixel.radiance,
+                                               some.met.interpolate(colors))])
+            mirrors.append(mirrored)
+        return mirrors
+
+    @cached_property
+    def whole(self) -> Part:
+        """All of it."""
+        return self._part(None)
+
+    @cached_property
+    def judging(self) -> list[FirstHits]:
+        """The rays that judge and meet it, for each split."""
+        return [self._first_hits(pool, JUDGING) for _, pool in self._pools]
+
+    def part(self, values: np.ndarray) -> Part:
+        """What the interpolated values (V,) are positive on."""
+        return self._part(mi.Float(np.ascontiguousarray(values, np.float32)))
+
+    def hits(self, pixel: PixelSample, values: mi.Float | None,
+             first: Met | None = None) -> Iterator[tuple[mi.UInt32, Met]]:
+        """Where the rays of pixels meet a part; their lanes, each once or not at all.
+
+        Args:
+            pixel: of the rays.
+            values: (V,) as of ``part``; None is the whole mesh.
+            first: where they meet the mesh first, if that is known.
+        """
+        lane = dr.arange(mi.UInt32, dr.width(pixel.view))
+        if first:
+            solid = first.hit & (first.values_at(values) > 0) if values is not None else first.hit
+            yield lane, replace(first, hit=solid)
+            if values is None:
+                return
+            lane = chosen_lanes(~solid, solid)
+        for sheet in self._sheets(pixel.at(lane) if first else pixel, values):
+            lane = dr.gather(mi.UInt32, lane, sheet.lane)
+            met = self._met(sheet)
+            yield lane, replace(met, hit=met.values_at(values) > 0) if values is not None else met
+
+    @cached_property
+    def _telling(self) -> list[FirstHits]:
+        with dr.suspend_grad():
+            return [self._first_hits(pool, _TELLING, covered=True) for pool, _ in self._pools]
+
+    def _first_hits(self, pixels: PixelPool, batches: int, *, covered: bool = False) -> FirstHits:
+        """Rays of random pixels, or of those that are covered; but for those that meet nothing."""
+        found = []
+        for step in range(batches):
+            sample = pixels.sample(self._batch, seed=self._seed, step=step)
+            if covered:
+                sample = sample.at(chosen_lanes(sample.alpha > COVERED, sample))
+            for sheet in self._sheets(sample, None):
+                found.append(FirstHits(sample.at(sheet.lane), self._met(sheet)))
+                dr.eval(found[-1])
+        # Arrays are never empty: a pixel whose ray meets nothing.
+        return joined_lanes(found) if found else FirstHits(pixels.sample(1, seed=0, step=0), Met.nothing())
+
+    def _part(self, values: mi.Float | None) -> Part:
+        with dr.suspend_grad():
+            return Part(self, values, [self._colors(split, values) for split in range(len(self._pools))])
+
+    def _colors(self, split: int, values: mi.Float | None) -> mi.Float:
+        rays = self._telling[split]
+        return self._mean_colors([(met, dr.gather(mi.Color3f, rays.pixel.radiance, lane))
+                                  for lane, met in self.hits(rays.pixel, values, rays.met)],
+                                 self.mirrors[split])
+
+    def _mean_colors(self, seen: list[tuple[Met, mi.Color3f]], mirrored: Mirrored) -> mi.Float:
+        """(2 V * 3) mean colour of each vertex' sides, of hits and the radiance that images show there."""
+        count = self._smooth.count
+        sums = [dr.zeros(mi.Float, 2 * count) for _ in range(4)]
+        for met, radiance in seen:
+            values = (*(radiance / mirrored.factor(met.mirrored)), mi.Float(1))
+            for vertex, weight in zip(met.vertices, met.weights, strict=True):
+                for total, value in zip(sums, values, strict=True):
+                    dr.scatter_reduce(dr.ReduceOp.Add, total, weight * value, vertex, met.hit)
+            dr.eval(sums)
+        side = 2 * dr.arange(mi.UInt32, count)
+        diffused = self._smooth.together({f"{back} {channel}": dr.gather(mi.Float, total, side + back)
+                                          for back in range(2) for channel, total in enumerate(sums)})
+        colors = dr.zeros(mi.Float, 6 * count)
+        for back in range(2):
+            *color, weight = (dr.maximum(diffused[f"{back} {channel}"], 0) for channel in range(4))
+            dr.scatter(colors, mi.Color3f(*color) / dr.maximum(weight, 1e-6), side + back)
+        dr.eval(colors)
+        return colors
+
+    def _sheets(self, pixel: PixelSample, values: mi.Float | None) -> list[Sheet]:
+        """What rays meet up to a part, or of the whole mesh."""
+        if not dr.width(pixel.view):
+            return []
+        ray = self.views.rays(pixel.view, pixel.film)
+        if values is None:
+            return trace_layers(self._scene, self._positions, self._faces, ray, 1, self._offset)
+        return trace_layers(self._scene, self._positions, self._faces, ray, _SHEETS, self._offset,
+                            lambda sheet: sheet.interpolate(values) <= 0)
+
+    def _met(self, sheet: Sheet) -> Met:
+        normal = sum((weight * dr.gather(mi.Vector3f, self._normals, corner)
+                      for weight, corner in zip(sheet.weights, sheet.face, strict=True)), mi.Vector3f(0))
+        return Met([sheet.side(corner) for corner in sheet.face], list(sheet.weights),
+                   mirrored_direction(dr.normalize(sheet.direction), normal),
+                   dr.full(mi.Bool, True, dr.width(sheet.lane)))
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a mesh as images show it.
+
+    Attributes:
+        shown: all of the mesh.
+        values: (V,) positive on the part; None is all of it.
+        colors: for each split of the views, (2 V * 3) of the front and the back of each vertex.
+    """
+
+    shown: Shown
+    values: mi.Float | None
+    colors: list[mi.Float]
+
+    def look(self, pixel: PixelSample, split: int, first: Met | None = None) -> tuple[mi.Color3f, mi.Float]:
+        """Radiance and coverage of pixels.
+
+        Args:
+            pixel: which.
+            split: whose colours are seen.
+            first: where their rays meet the whole mesh first, if that is known.
+        """
+        count = dr.width(pixel.view)
+        radiance, alpha = dr.zeros(mi.Color3f, count), dr.zeros(mi.Float, count)
+        mirrored = self.shown.mirrors[split]
+        for lane, met in self.shown.hits(pixel, self.values, first):
+            color = met.interpolate(self.colors[split]) * mirrored.factor(met.mirrored)
+            dr.scatter(radiance, color, lane, met.hit)
+            dr.scatter(alpha, mi.Float(1), lane, met.hit)
         dr.eval(radiance, alpha)
         return radiance, alpha
-
-    def _look(self, views: PinholeViews, pool: PixelPool, batch: int, seed: int,
-              known: Mirrored | None) -> Look:
-        seen = []
-        for step in range(BATCHES):
-            sample = pool.sample(batch, seed=seed, step=step)
-            met = self._met(views.rays(sample.view, sample.film))
-            lane = dr.compress(met.hit & (sample.alpha > COVERED))
-            if not dr.width(lane):
-                continue  # what is left of a surface may be too small for any ray to meet
-            seen.append((met.at(lane), dr.gather(mi.Color3f, sample.radiance, lane)))
-            dr.eval(seen[-1])
-        mirrored = known or Mirrored.nothing()
-        colors = mean_colors(seen, mirrored, self._smooth)
-        for _ in range(0 if known else _ROUNDS):
-            mirrored = mirrored.improved([(met.mirrored, radiance, met.interpolate(colors))
-                                          for met, radiance in seen[:_MIRRORED_BATCHES]])
-            colors = mean_colors(seen, mirrored, self._smooth)
-        return Look(colors, mirrored)
-
-    def _met(self, ray: mi.Ray3f) -> Met:
-        found = self._scene.ray_intersect_preliminary(ray, coherent=False)
-        dr.eval(found)
-        hit = found.is_valid()
-        back = dr.dot(found.compute_surface_interaction(ray, mi.RayFlags.Minimal, hit).n, ray.d) > 0
-        uv = dr.select(hit, found.prim_uv, 0)
-        weights, vertices, normal = [1 - uv.x - uv.y, uv.x, uv.y], [], mi.Vector3f(0)
-        for corner, weight in enumerate(weights):
-            vertex = dr.gather(mi.UInt32, self._corners, 3 * found.prim_index + corner, hit)
-            normal += weight * dr.gather(mi.Vector3f, self._normals, vertex, hit)
-            vertices.append(2 * vertex + dr.select(back, mi.UInt32(1), 0))
-        return Met(vertices, weights, mirrored_direction(dr.normalize(ray.d), normal), hit)
-
-
-def mean_colors(seen: Iterable[tuple[Met, mi.Color3f]], mirrored: Mirrored,
-                smooth: MeshDiffusion) -> mi.Float:
-    """(2 V * 3) mean colour of each vertex' sides.
-
-    Args:
-        seen: hits and the radiance that images show there.
-        mirrored: factor of that.
-        smooth: along the mesh.
-    """
-    sums = [dr.zeros(mi.Float, 2 * smooth.count) for _ in range(4)]
-    for met, radiance in seen:
-        values = (*(radiance / mirrored.factor(met.mirrored)), mi.Float(1))
-        for vertex, weight in zip(met.vertices, met.weights, strict=True):
-            for total, value in zip(sums, values, strict=True):
-                dr.scatter_reduce(dr.ReduceOp.Add, total, weight * value, vertex, met.hit)
-        dr.eval(sums)
-    side = 2 * dr.arange(mi.UInt32, smooth.count)
-    diffused = smooth.together({f"{back} {index}": dr.gather(mi.Float, total, side + back)
-                                for back in range(2) for index, total in enumerate(sums)})
-    colors = dr.zeros(mi.Float, 6 * smooth.count)
-    for back in range(2):
-        *color, weight = (dr.maximum(diffused[f"{back} {index}"], 0) for index in range(4))
-        dr.scatter(colors, mi.Color3f(*color) / dr.maximum(weight, 1e-6), side + back)
-    dr.eval(colors)
-    return colors

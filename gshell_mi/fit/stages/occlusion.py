@@ -71,7 +71,8 @@ class Occlusion:
                 place = _larger(before, after, cell)
                 if (place < 0).all():
                     continue
-                verdict = fit.judge.compare(shown, fit.judge.shown(after, like=shown), (after, place))
+                hull = fit.judge.shown(after, like=shown)
+                verdict = fit.judge.compare(shown.whole, hull.whole, place, hull)
                 for name, values in verdict.facts().items():
                     facts[name] += values
                 chosen = (place >= 0) & verdict.accepted[place]

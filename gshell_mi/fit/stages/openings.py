@@ -28,7 +28,7 @@ from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from ..judge import Judge
 from ..radiance.acceptance import close_rejected, close_shallow, open_rejected
-from ..radiance.parts import Parts
+from ..radiance.shown import Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
 from ..stage import Fit
@@ -91,8 +91,7 @@ class Openings:
             if not fit.config.watertight:
                 min_area = fit.config.topology.min_area
                 thickness, _ = opposite_sides(template.start, template.start, faces, fit.cell(surface))
-                parts = fit.judge.parts(template.closed, closed)
-                logits = find_openings(appearance, parts, fit.judge, self.config.rounds,
+                logits = find_openings(appearance, closed, fit.judge, self.config.rounds,
                                        lambda logits: close_shallow(
                                            clean_opacity(logits, vertices, faces, min_area), faces,
                                            np.isfinite(thickness)),
@@ -170,13 +169,13 @@ def justified(smoothed: np.ndarray, logits: np.ndarray, clean: Callable[[np.ndar
     return logits
 
 
-def find_openings(appearance: SurfaceRadiance, parts: Parts, judge: Judge, rounds: int,
+def find_openings(appearance: SurfaceRadiance, template: Shown, judge: Judge, rounds: int,
                   clean: Callable[[np.ndarray], np.ndarray], train: Callable[[int], None]) -> np.ndarray:
     """Where the images justify an opening.
 
     Args:
         appearance: after its training; it is trained further.
-        parts: of the template that it is on.
+        template: that it is on, closed.
         judge: of the fit.
         rounds: in which it is trained again, at most.
         clean: undoes what cannot be meant in (V,) logits: cuts and islands that are too small, as
@@ -195,7 +194,7 @@ def find_openings(appearance: SurfaceRadiance, parts: Parts, judge: Judge, round
         proposed = clean(np.where(opened, np.minimum(smoothed, _OPEN), smoothed))
         logits = np.where(opened, _OPEN, np.abs(smoothed))
         logits = clean(justified(smoothed, logits, clean, lambda candidate: open_rejected(
-            clean(close_rejected(candidate, parts, judge, parts.all)), parts, judge)))
+            clean(close_rejected(candidate, template, judge, template.whole)), template, judge)))
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
         unjustified |= (proposed <= 0) & (logits > 0)

@@ -22,7 +22,7 @@ from ...topology import lobes
 from ...triangles import positive_part
 from ..judge import Judge, places_of
 from ..radiance.acceptance import WORST, close_rejected, close_shallow
-from ..radiance.parts import Parts
+from ..radiance.shown import Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
 from ..stage import Fit
@@ -63,13 +63,13 @@ class Revision:
             thickness, opposite = opposite_sides(vertices, vertices, faces, cell)
             thin = np.isfinite(thickness)
             smooth = least_bent(vertices, faces, (values <= 0) & ~thin)
-            revised = _closed(fit.judge, fit.judge.parts((smooth, faces), now), values,
+            revised = _closed(fit.judge, fit.judge.shown((smooth, faces), like=now), values,
                               np.where(thin, opposite, -1))
             capped = (values <= 0) & (revised > 0)
             moved = np.where(capped[:, None], smooth, vertices)
-            parts = fit.judge.parts((moved, faces), now)
-            revised = _with_islands(fit.judge, parts, revised, proposed)
-            revised = _opened(fit, parts, revised, proposed, thin)
+            shown = fit.judge.shown((moved, faces), like=now)
+            revised = _with_islands(fit.judge, shown, revised, proposed)
+            revised = _opened(fit, shown, revised, proposed, thin)
             revised = clean_opacity(revised, moved, faces, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
         steps.fact("openings_changed", bool(changed.any()))
@@ -88,7 +88,7 @@ class Revision:
         return replace(surface.with_fields(sdf=sdf, msdf=msdf), settled=False)
 
 
-def _closed(judge: Judge, parts: Parts, values: np.ndarray, opposite: np.ndarray) -> np.ndarray:
+def _closed(judge: Judge, template: Shown, values: np.ndarray, opposite: np.ndarray) -> np.ndarray:
     """Closes openings that explain unseen views no better than caps that go on as their surroundings do.
 
     Nothing has shaped the caps so far, and a hull's bulge explains too little to stand for a surface. Through
@@ -98,7 +98,7 @@ def _closed(judge: Judge, parts: Parts, values: np.ndarray, opposite: np.ndarray
 
     Args:
         judge: of the fit.
-        parts: of the template with such caps.
+        template: with such caps, closed.
         values: (V,) negative at its openings.
         opposite: (V,) vertex on the template's other side, -1 if that is not near.
 
@@ -110,8 +110,8 @@ def _closed(judge: Judge, parts: Parts, values: np.ndarray, opposite: np.ndarray
         chosen = values <= 0
         if not chosen.any():
             break
-        place = places_of(chosen, lobes(chosen, parts.faces))
-        verdict = judge.compare_parts(parts.of(values), parts.all, place)
+        place = places_of(chosen, lobes(chosen, template.mesh[1]))
+        verdict = judge.compare(template.part(values), template.whole, place)
         backed = thin & (values[opposite] > 0)
         alone = 2 * np.bincount(place[chosen], backed[chosen]) <= np.bincount(place[chosen])
         gain = np.where(np.isfinite(verdict.noise) & alone, verdict.gain, 0)
@@ -122,13 +122,13 @@ def _closed(judge: Judge, parts: Parts, values: np.ndarray, opposite: np.ndarray
     return values
 
 
-def _with_islands(judge: Judge, parts: Parts, values: np.ndarray, proposed: np.ndarray) -> np.ndarray:
+def _with_islands(judge: Judge, template: Shown, values: np.ndarray, proposed: np.ndarray) -> np.ndarray:
     """(V,) values, those in openings negated where the radiance shows something opaque that explains unseen
     views better, such as an island."""
     while (chosen := (values <= 0) & (proposed > 0)).any():
-        place = places_of(chosen, lobes(chosen, parts.faces))
-        after = parts.of(np.where(chosen, np.abs(values), values))
-        verdict = judge.compare_parts(parts.of(values), after, place)
+        place = places_of(chosen, lobes(chosen, template.mesh[1]))
+        after = template.part(np.where(chosen, np.abs(values), values))
+        verdict = judge.compare(template.part(values), after, place)
         gain = np.where(verdict.accepted, verdict.gain, 0)
         if not gain.any():
             break
@@ -136,18 +136,19 @@ def _with_islands(judge: Judge, parts: Parts, values: np.ndarray, proposed: np.n
     return values
 
 
-def _opened(fit: Fit, parts: Parts, values: np.ndarray, proposed: np.ndarray, thin: np.ndarray) -> np.ndarray:
+def _opened(fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray,
+            thin: np.ndarray) -> np.ndarray:
     """(V,) values, negative also where unseen views are explained better without the surface.
 
     Args:
         fit: the views.
-        parts: of the template.
+        template: closed.
         values: (V,) negative at its openings.
         proposed: (V,) opacity logits.
         thin: (V,) where the template's other side is within two cells.
     """
-    vertices, faces = parts.template.mesh
-    given, now = values <= 0, parts.of(values)
+    vertices, faces = template.mesh
+    given, now = values <= 0, template.part(values)
 
     def clean(logits: np.ndarray) -> np.ndarray:
         both = np.where(given, values, logits)
@@ -156,4 +157,4 @@ def _opened(fit: Fit, parts: Parts, values: np.ndarray, proposed: np.ndarray, th
 
     start = np.where(given, values, np.abs(proposed))
     return justified(proposed, start, clean, lambda candidate: close_rejected(
-        candidate, parts, fit.judge, now, given))
+        candidate, template, fit.judge, now, given))

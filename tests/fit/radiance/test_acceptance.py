@@ -11,8 +11,8 @@ from gshell_mi.topology import equal_patches
 
 def _closed(ball, logits, error, **noise):
     judge = ScriptedJudge(len(ball.vertices), error, **noise)
-    parts = judge.parts((ball.vertices, ball.faces))
-    return close_rejected(logits, parts, judge, parts.all), judge
+    template = judge.shown((ball.vertices, ball.faces))
+    return close_rejected(logits, template, judge, template.whole), judge
 
 
 def test_an_opening_stays_if_it_explains_the_images(ball):
@@ -102,17 +102,17 @@ def test_an_island_has_to_be_justified(ball, without, stays):
     island, around = cap(ball, [0, 0, 1], 0.02), cap(ball, [0, 0, 1], 0.2)
     logits = np.where(around & ~island, -1.0, 2.0)
     judge = ScriptedJudge(len(logits), lambda opaque: np.where(opaque | ~island, 1.0, without))
-    result = open_rejected(logits, judge.parts((ball.vertices, ball.faces)), judge)
+    result = open_rejected(logits, judge.shown((ball.vertices, ball.faces)), judge)
     np.testing.assert_array_equal(result > 0, ~around | island if stays else ~around)
 
 
 def test_without_islands_nothing_is_asked(ball):
     logits = np.where(cap(ball, [0, 0, 1], 0.1), -1.0, 1.0)
     judge = ScriptedJudge(len(logits), None)
-    assert open_rejected(logits, judge.parts((ball.vertices, ball.faces)), judge) is logits
+    assert open_rejected(logits, judge.shown((ball.vertices, ball.faces)), judge) is logits
 
 
 def test_nothing_open_nothing_asked(ball):
     logits = np.ones(len(ball.vertices))
     judge = ScriptedJudge(len(logits), None)
-    assert close_rejected(logits, judge.parts((ball.vertices, ball.faces)), judge, None) is logits
+    assert close_rejected(logits, judge.shown((ball.vertices, ball.faces)), judge, None) is logits

@@ -91,7 +91,7 @@ def test_highlights_pull_the_surface_inwards_far_less():
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     offsets = {}
-    shown = Shown((vertices, faces), views, [pixels], batch=16384, seed=0)
+    shown = Shown((vertices, faces), views, [(pixels, pixels)], batch=16384, seed=0)
     for known in (False, True):
         appearance = SurfaceRadiance(vertices, faces, views, pixels, RADIANCE,
                                      mirrored=shown.mirrored if known else None)
@@ -113,6 +113,6 @@ def test_the_judge_takes_no_polished_place_for_a_window():
     window = vertices @ [1, 0, 0] > 0.75 * RADIUS
     judge = Judge(views, targets, Judge.halves(len(views)), batch=16384)
     opened = positive_part(vertices, faces, np.where(window, -1.0, 1.0))
-    verdict = judge.compare(judge.shown((vertices, faces)), judge.shown(opened),
-                            ((vertices, faces), np.where(window, 0, -1)))
+    verdict = judge.compare(judge.shown((vertices, faces)).whole, judge.shown(opened).whole,
+                            np.where(window, 0, -1))
     assert (verdict.gain < -2 * verdict.noise).tolist() == [True]

@@ -54,7 +54,7 @@ class ScriptedRadiance:
 def found_openings(appearance: ScriptedRadiance, rounds: int = 3) -> np.ndarray:
     clean = partial(clean_opacity, vertices=VERTICES, faces=FACES, min_area=0.005)
     judge = ScriptedJudge(len(VERTICES), appearance.error)
-    return find_openings(appearance, judge.parts((VERTICES, FACES)), judge, rounds, clean,
+    return find_openings(appearance, judge.shown((VERTICES, FACES)), judge, rounds, clean,
                          appearance.train) <= 0
 
 

@@ -1,6 +1,5 @@
-"""Parts of a template look like meshes that are cut out of it."""
+"""Parts of a mesh look like meshes that are cut out of it."""
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from cap import cap
@@ -29,25 +28,19 @@ def closed(judge, template):
     return judge.shown(template)
 
 
-@pytest.fixture(scope="module")
-def parts(judge, template, closed):
-    return judge.parts(template, closed)
-
-
 def _values(ball, *directions):
     """Negative in caps around some directions, by the distance from their rims."""
     return np.min([np.arccos(np.clip(ball.vertices @ np.array(direction), -1, 1)) - 0.6
                    for direction in directions], axis=0)
 
 
-def test_rays_meet_a_part_where_they_meet_its_mesh(ball, judge, template, closed, parts):
+def test_rays_meet_a_part_where_they_meet_its_mesh(ball, judge, template, closed):
     """Through one opening and out of another one, too."""
     values = _values(ball, [0, 1, 0], [0, -1, 0], [1, 0, 0])
-    part, mesh = parts.of(values), judge.shown(positive_part(*template, values), like=closed)
-    for split, rays in enumerate(parts.judging):
-        radiance, alpha = (value.numpy() for value in part.look(rays, split))
-        expected, covered = (value.numpy() for value in mesh.look(
-            judge.views.rays(rays.pixel.view, rays.pixel.film), split))
+    part, mesh = closed.part(values), judge.shown(positive_part(*template, values), like=closed)
+    for split, rays in enumerate(closed.judging):
+        radiance, alpha = (value.numpy() for value in part.look(rays.pixel, split, rays.met))
+        expected, covered = (value.numpy() for value in mesh.whole.look(rays.pixel, split))
         assert (alpha != covered).mean() < 1e-3 and 0.02 < (covered == 0).mean() < 0.5
         both = (alpha > 0) & (covered > 0)
         error = np.abs(radiance - expected)[:, both]
@@ -55,34 +48,38 @@ def test_rays_meet_a_part_where_they_meet_its_mesh(ball, judge, template, closed
         assert error.mean() < 0.05 * expected[:, both].mean()
 
 
-def test_a_part_is_judged_as_its_mesh_is(ball, judge, template, closed, parts):
+def test_a_part_is_judged_as_its_mesh_is(ball, judge, template, closed):
     up, side = cap(ball, [0, 1, 0], 0.3), cap(ball, [1, 0, 0], 0.1)
     place = np.where(up, 0, np.where(side, 1, -1))
     values = _values(ball, [0, 1, 0])
-    quick = judge.compare_parts(parts.all, parts.of(values), place)
+    quick = judge.compare(closed.whole, closed.part(values), place)
     mesh = judge.shown(positive_part(*template, values), like=closed)
-    exact = judge.compare(closed, mesh, (template, place))
+    exact = judge.compare(closed.whole, mesh.whole, place)
     np.testing.assert_allclose(quick.gain, exact.gain, atol=0.1 * exact.noise.max())
     np.testing.assert_allclose(quick.noise, exact.noise, atol=0.1 * exact.noise.max())
     np.testing.assert_allclose(quick.before, exact.before, rtol=0.02)
 
 
-def test_what_is_the_same_is_judged_the_same(ball, judge, parts):
-    verdict = judge.compare_parts(parts.all, parts.of(np.ones(len(ball.vertices))),
-                                  np.zeros(len(ball.vertices), int))
+def test_what_is_the_same_is_judged_the_same(ball, judge, closed):
+    verdict = judge.compare(closed.whole, closed.part(np.ones(len(ball.vertices))),
+                            np.zeros(len(ball.vertices), int))
     assert verdict.gain == pytest.approx(0, abs=1e-5) and not verdict.accepted
 
 
-def test_nothing_left_shows_nothing(ball, parts):
-    rays = parts.judging[0]
-    radiance, alpha = parts.of(-np.ones(len(ball.vertices))).look(rays, 0)
+def test_nothing_left_shows_nothing(ball, closed):
+    rays = closed.judging[0]
+    radiance, alpha = closed.part(-np.ones(len(ball.vertices))).look(rays.pixel, 0, rays.met)
     assert not alpha.numpy().any() and not radiance.numpy().any()
 
 
 def test_rays_that_meet_nothing_tell_nothing(ball, judge, template):
     """The template is behind all cameras."""
-    away = template[0] + 100, template[1]
-    parts = judge.parts(away, judge.shown(away))
-    verdict = judge.compare_parts(parts.all, parts.all, np.zeros(len(ball.vertices), int))
+    away = judge.shown((template[0] + 100, template[1]))
+    verdict = judge.compare(away.whole, away.whole, np.zeros(len(ball.vertices), int))
     assert np.isinf(verdict.noise).all()
-    assert isinstance(parts.judging[0].met.hit, mi.Bool)
+
+
+def test_a_mesh_without_faces_shows_nothing(judge, closed):
+    nothing = judge.shown((np.zeros((0, 3)), np.zeros((0, 3), int)), like=closed)
+    _, alpha = nothing.whole.look(closed.judging[0].pixel, 0)
+    assert not alpha.numpy().any()
