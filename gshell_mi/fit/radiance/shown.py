@@ -130,26 +130,24 @@ class Shown:
         """What the surface mirrors, by all splits."""
         return Mirrored.mean(self.mirrors)
 
-    @cached_property
+    @property
     def mirrors(self) -> list[Mirrored]:
         """What it mirrors, by each split."""
-        if self._like:
-            return self._like.mirrors
-        mirrors = []
-        for rays in self._telling:
-            mirrored, every = Mirrored.nothing(), dr.width(rays.pixel.view)
-            some = rays.at(dr.arange(mi.UInt32, max(int(_MIRRORED_SHARE * every), 1)))
-            for _ in range(_ROUNDS):
-                colors = self._mean_colors([(rays.met, rays.pixel.radiance)], mirrored)
-                mirrored = mirrored.improved([(some.met.mirrored, some.pixel.radiance,
-                                               some.met.interpolate(colors))])
-            mirrors.append(mirrored)
-        return mirrors
+        return self._like.mirrors if self._like else self._first_look[0]
 
-    @cached_property
+    @property
     def whole(self) -> Part:
         """All of it."""
-        return self._part(None)
+        return Part(self, None, self._first_look[1])
+
+    @cached_property
+    def _first_look(self) -> tuple[list[Mirrored], list[mi.Float]]:
+        """What it mirrors, and the colours of all of it. Of most meshes no more is asked: no ray is kept."""
+        with dr.suspend_grad():
+            telling = self._told()
+            mirrors = self._like.mirrors if self._like else [self._mirrored_by(rays) for rays in telling]
+            return mirrors, [self._mean_colors([(rays.met, rays.pixel.radiance)], mirrored)
+                             for rays, mirrored in zip(telling, mirrors, strict=True)]
 
     @cached_property
     def judging(self) -> list[FirstHits]:
@@ -158,7 +156,12 @@ class Shown:
 
     def part(self, values: np.ndarray) -> Part:
         """What the interpolated values (V,) are positive on."""
-        return self._part(mi.Float(np.ascontiguousarray(values, np.float32)))
+        field = mi.Float(np.ascontiguousarray(values, np.float32))
+        with dr.suspend_grad():
+            return Part(self, field, [
+                self._mean_colors([(met, dr.gather(mi.Color3f, rays.pixel.radiance, lane))
+                                   for lane, met in self.hits(rays.pixel, field, rays.met)], mirrored)
+                for rays, mirrored in zip(self._telling, self.mirrors, strict=True)])
 
     def hits(self, pixel: PixelSample, values: mi.Float | None,
              first: Met | None = None) -> Iterator[tuple[mi.UInt32, Met]]:
@@ -183,8 +186,23 @@ class Shown:
 
     @cached_property
     def _telling(self) -> list[FirstHits]:
-        with dr.suspend_grad():
-            return [self._first_hits(pool, _TELLING, covered=True) for pool, _ in self._pools]
+        """As of ``_told``, kept: the parts of a template are many."""
+        return self._told()
+
+    def _told(self) -> list[FirstHits]:
+        """The rays that tell the colours, for each split."""
+        return [self._first_hits(pool, _TELLING, covered=True) for pool, _ in self._pools]
+
+    def _mirrored_by(self, rays: FirstHits) -> Mirrored:
+        """What some rays say that the surface mirrors."""
+        mirrored = Mirrored.nothing()
+        count = max(int(_MIRRORED_SHARE * dr.width(rays.pixel.view)), 1)
+        some = rays.at(dr.arange(mi.UInt32, count))
+        for _ in range(_ROUNDS):
+            colors = self._mean_colors([(rays.met, rays.pixel.radiance)], mirrored)
+            mirrored = mirrored.improved([(some.met.mirrored, some.pixel.radiance,
+                                           some.met.interpolate(colors))])
+        return mirrored
 
     def _first_hits(self, pixels: PixelPool, batches: int, *, covered: bool = False) -> FirstHits:
         """Rays of random pixels, or of those that are covered; but for those that meet nothing."""
@@ -198,16 +216,6 @@ class Shown:
                 dr.eval(found[-1])
         # Arrays are never empty: a pixel whose ray meets nothing.
         return joined_lanes(found) if found else FirstHits(pixels.sample(1, seed=0, step=0), Met.nothing())
-
-    def _part(self, values: mi.Float | None) -> Part:
-        with dr.suspend_grad():
-            return Part(self, values, [self._colors(split, values) for split in range(len(self._pools))])
-
-    def _colors(self, split: int, values: mi.Float | None) -> mi.Float:
-        rays = self._telling[split]
-        return self._mean_colors([(met, dr.gather(mi.Color3f, rays.pixel.radiance, lane))
-                                  for lane, met in self.hits(rays.pixel, values, rays.met)],
-                                 self.mirrors[split])
 
     def _mean_colors(self, seen: list[tuple[Met, mi.Color3f]], mirrored: Mirrored) -> mi.Float:
         """(2 V * 3) mean colour of each vertex' sides, of hits and the radiance that images show there."""
