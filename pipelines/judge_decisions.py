@@ -41,7 +41,8 @@ from gshell_mi.fit.surface import Surface  # noqa: E402
 from gshell_mi.fit.template import template_of  # noqa: E402
 from gshell_mi.scene import load_fit_scene  # noqa: E402
 from gshell_mi.targets import Target  # noqa: E402
-from gshell_mi.topology import equal_patches  # noqa: E402
+from gshell_mi.template.msdf import clean_opacity  # noqa: E402
+from gshell_mi.topology import equal_patches, mesh_components, topology  # noqa: E402
 from gshell_mi.views import PinholeViews  # noqa: E402
 
 SCENES = [REPOSITORY / "scenes" / f"{name}.xml" for name in ("tshirt", "skirt", "mug", "chair")]
@@ -77,12 +78,17 @@ truth in per cent of its diagonal, before → after all of the proposal. A chang
 
 {changes}
 
+In *occlusion* each place is a hull that fewer masks shape; few are right, and those alone are taken.
+
 ## Openings, true and false, in spoilt images
 
 All openings that the first half of a fit finds are proposed again, and as many round holes where the truth is
 closed: with other random rays, with noise of {noise} on every pixel (white is 1), with each camera turned by
 {pixels:g} pixel in a random direction, and with a random texture on the object that changes its colour by up
 to half, its finest waves as long as a cell. *z* is the gain over its standard error; 2 is needed.
+
+Noise hides what is dark behind an opening: those that are missed here are asked for again when the joint stage
+has moved the surface (*revision*).
 
 {openings}
 """
@@ -252,12 +258,17 @@ def holes(vertices: np.ndarray, faces: np.ndarray, opened: np.ndarray, closed: n
 
 
 def decided_openings(path: Path, config: FitConfig, surface: Surface) -> list[dict]:
-    """What is said of true openings and of holes that are not there, in each of the spoilt images."""
+    """What is said of true openings and of holes that are not there, in each of the spoilt images; nothing if
+    the truth is closed."""
     scene, truth = load_fit_scene(path), trimesh.load(path.with_suffix("") / "truth.ply", process=False)
+    if topology(np.asarray(truth.vertices), np.asarray(truth.faces)).boundary_loops == 0:
+        return []
     fit = Fit(scene, config, Lattices.of(scene.subject, config))
     template, cell = template_of(scene.subject, surface), fit.cell(surface)
     mesh = vertices, faces = template.closed
-    opened = template.logits <= 0
+    opened = clean_opacity(template.logits, vertices, faces, config.topology.min_area) <= 0
+    piece = mesh_components(faces, len(vertices))
+    opened &= (np.bincount(piece, ~opened) > 0)[piece]    # what is all open is no opening in anything
     points, _ = trimesh.sample.sample_surface(truth, 4 * _POINTS, seed=0)
     near = cKDTree(points).query(vertices)[0] < _NEAR * cell
     true = places_of(opened, equal_patches(opened, faces))
