@@ -78,7 +78,8 @@ truth in per cent of its diagonal, before → after all of the proposal. A chang
 
 {changes}
 
-In *occlusion* each place is a hull that fewer masks shape; few are right, and those alone are taken.
+In *occlusion* all places together are a hull that fewer masks shape; only those that are accepted are taken,
+so a later row starts from what an earlier one has left.
 
 ## Openings, true and false, in spoilt images
 
