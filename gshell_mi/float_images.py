@@ -144,16 +144,20 @@ def _stored(path: Path, number: int, names: list[str]) -> dict[str, np.ndarray]:
     file = OpenEXR.InputFile(str(path))
     if not file.isComplete():
         raise ValueError("it is cut off")
-    _check_rows(path)
+    _check_rows(path, [channel.type.v for channel in file.header()["channels"].values()])
     read = file.channels(names, Imath.PixelType(Imath.PixelType.FLOAT))
     return {name: np.frombuffer(values, np.float32) for name, values in zip(names, read, strict=True)}
 
 
-def _check_rows(path: Path) -> None:
-    """Whether the rows of a file are where its table says.
+def _check_rows(path: Path, kinds: list[int]) -> None:
+    """Whether the rows of a file are where its table says, and packed into no more than they are.
 
     Newer readers take what is there instead. Mitsuba's raises an exception in one of its threads, which now
     and then ends the process.
+
+    Args:
+        path: of a file of one part.
+        kinds: of its channels, by the library's numbers.
 
     Raises:
         ValueError: they are not.
@@ -172,8 +176,11 @@ def _check_rows(path: Path) -> None:
     table = np.frombuffer(data, "<u8", len(rows), at + 1)
     if table.max() > len(data) - 8:
         raise ValueError("it is damaged")
-    places = table.astype(np.int64)[:, None] + np.arange(4)
-    if (np.frombuffer(data, np.uint8)[places].copy().view("<i4")[:, 0] != rows).any():
+    places = table.astype(np.int64)[:, None] + np.arange(8)
+    row, length = np.frombuffer(data, np.uint8)[places].copy().view("<i4").T
+    width = int(header["dataWindow"][1][0]) - int(header["dataWindow"][0][0]) + 1
+    most = step * width * sum(2 if kind == Imath.PixelType.HALF else 4 for kind in kinds)
+    if (row != rows).any() or (length < 0).any() or (length > most).any():
         raise ValueError("it is damaged")
 
 

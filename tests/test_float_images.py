@@ -101,7 +101,7 @@ def test_damaged_files_are_told_without_a_word_of_the_library(tmp_path, capfd):
 
 
 @pytest.mark.parametrize("compression", ["NO", "ZIPS", "ZIP", "PIZ", "DWAA", "DWAB", "RLE", "PXR24", "B44"])
-def test_rows_that_say_to_be_others(compression, tmp_path):
+def test_rows_that_say_to_be_others_or_longer(compression, tmp_path):
     """Mitsuba's reader ends the process at these, now and then."""
     path = tmp_path / "a.exr"
     pixels = np.tile(np.linspace(0, 1, 300, dtype=np.float32)[:, None], (1, 8))
@@ -111,10 +111,12 @@ def test_rows_that_say_to_be_others(compression, tmp_path):
     np.testing.assert_allclose(read_float_image(path)[0][..., 0], pixels, atol=0.01)
     data = bytearray(path.read_bytes())
     offsets = np.frombuffer(bytes(data), "<u8", 2, _end_of_header(data))
-    data[offsets[1]:offsets[1] + 4] = (7777).to_bytes(4, "little")
-    path.write_bytes(data)
-    with pytest.raises((ValueError, OSError, RuntimeError)):
-        read_float_image(path)
+    for place in (0, 4):    # the row, and how many bytes follow
+        damaged = bytearray(data)
+        damaged[offsets[1] + place:offsets[1] + place + 4] = (77_777_777).to_bytes(4, "little")
+        path.write_bytes(damaged)
+        with pytest.raises((ValueError, OSError, RuntimeError)):
+            read_float_image(path)
 
 
 def _end_of_header(data: bytes) -> int:
