@@ -461,6 +461,14 @@ def test_a_unit_sphere_that_nobody_has_fitted(tmp_path):
     assert 200 * RADIUS < np.ptp(result.box, axis=0).max() < 300 * RADIUS    # masks are of few pixels
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_a_sphere_that_nobody_can_compute_with_is_none(tmp_path, value):
+    def edit(arrays, index, camera):
+        arrays[f"scale_mat_{index}"] = np.diag([value, 1, 1, 1])
+
+    assert read_capture(idr_arrays(tmp_path, edit)).region is None
+
+
 # --- what is written
 
 

@@ -68,7 +68,8 @@ def read(source: Path, images: Path | None = None) -> Capture:
         world = arrays.get(f"world_mat_{index}", np.zeros(0))
         frames.append(Frame(image, _camera(world, arrays.get(f"camera_mat_{index}"), image, owner)))
         scale = arrays.get(f"scale_mat_{index}")
-        if scale is not None and scale.shape == (4, 4) and np.isfinite(scale).all():
+        # NaN, infinity and what nobody can compute with is no region.
+        if scale is not None and scale.shape == (4, 4) and (np.abs(scale) <= 1e12).all():
             radius = np.linalg.norm(scale[:3, :3], axis=1)
             regions.append([scale[:3, 3] - radius, scale[:3, 3] + radius])
     region = np.mean(regions, axis=0) if regions else None
