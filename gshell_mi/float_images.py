@@ -26,9 +26,9 @@ from .plain_float_images import (
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 #: First bytes of what Mitsuba reads besides: Radiance, PFM, PPM, PNG, JPEG and BMP. TGA it reads unchecked.
 _MITSUBA_KINDS = (b"#?", b"PF", b"Pf", b"P6", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"BM")
-#: Rows that are packed together, by the compression.
-_ROWS = {"NO": 1, "RLE": 1, "ZIPS": 1, "ZIP": 16, "PXR24": 16, "PIZ": 32, "B44": 32, "B44A": 32, "DWAA": 32,
-         "DWAB": 256}
+#: Rows that are packed together, by the compression's number: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A,
+#: DWAA, DWAB.
+_ROWS = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
 #: Flags of files with other than one part of rows: tiles, deep pixels or several parts.
 _NO_ROWS = 0x1A00
 #: Windows and sizes beyond these shares of each other come from damaged headers.
@@ -144,12 +144,12 @@ def _stored(path: Path, number: int, names: list[str]) -> dict[str, np.ndarray]:
     file = OpenEXR.InputFile(str(path))
     if not file.isComplete():
         raise ValueError("it is cut off")
-    _check_rows(path, [channel.type.v for channel in file.header()["channels"].values()])
+    _check_rows(path, file.header())
     read = file.channels(names, Imath.PixelType(Imath.PixelType.FLOAT))
     return {name: np.frombuffer(values, np.float32) for name, values in zip(names, read, strict=True)}
 
 
-def _check_rows(path: Path, kinds: list[int]) -> None:
+def _check_rows(path: Path, header: dict) -> None:
     """Whether the rows of a file are where its table says, and packed into no more than they are.
 
     Newer readers take what is there instead. Mitsuba's raises an exception in one of its threads, which now
@@ -157,29 +157,28 @@ def _check_rows(path: Path, kinds: list[int]) -> None:
 
     Args:
         path: of a file of one part.
-        kinds: of its channels, by the library's numbers.
+        header: of it, as the library's older interface gives it.
 
     Raises:
         ValueError: they are not.
     """
-    data, header = path.read_bytes(), _open(path, header_only=True).parts[0].header
-    step = _ROWS.get(header["compression"].name.removesuffix("_COMPRESSION"))
-    if step is None or int.from_bytes(data[4:8], "little") & _NO_ROWS:
+    data, compression, window = path.read_bytes(), header["compression"].v, header["dataWindow"]
+    if compression >= len(_ROWS) or int.from_bytes(data[4:8], "little") & _NO_ROWS:
         return
+    step = _ROWS[compression]
     at = 8
     while data[at]:    # name and type of an attribute, which end with a 0, and the size of its value
         for _ in range(2):
             at = data.index(0, at) + 1
         at += 4 + int.from_bytes(data[at:at + 4], "little")
-    top, bottom = (int(corner[1]) for corner in header["dataWindow"])
-    rows = np.arange(top, bottom + 1, step)
+    rows = np.arange(window.min.y, window.max.y + 1, step)
     table = np.frombuffer(data, "<u8", len(rows), at + 1)
     if table.max() > len(data) - 8:
         raise ValueError("it is damaged")
     places = table.astype(np.int64)[:, None] + np.arange(8)
     row, length = np.frombuffer(data, np.uint8)[places].copy().view("<i4").T
-    width = int(header["dataWindow"][1][0]) - int(header["dataWindow"][0][0]) + 1
-    most = step * width * sum(2 if kind == Imath.PixelType.HALF else 4 for kind in kinds)
+    pixel = sum(2 if channel.type.v == Imath.PixelType.HALF else 4 for channel in header["channels"].values())
+    most = step * (window.max.x - window.min.x + 1) * pixel
     if (row != rows).any() or (length < 0).any() or (length > most).any():
         raise ValueError("it is damaged")
 

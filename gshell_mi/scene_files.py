@@ -162,6 +162,8 @@ def _check_images(props: mi.Properties) -> None:
         if not _is_plain_exr(path):
             raise ValueError(f"image '{path}' has a data window other than its display window, which Mitsuba "
                              f"cannot read; write it without a border or crop")
+        if props.plugin_name() == "envmap":
+            return    # it has just been read
     try:
         (read_float_image if is_exr(path) else check_for_mitsuba)(path)
     except Exception as error:

@@ -30,6 +30,7 @@ sys.path[:0] = [str(REPOSITORY / "pipelines"), str(REPOSITORY)]
 from fit_study.settings import parsed_settings  # noqa: E402
 
 from gshell_mi.doctor import ensure_variant  # noqa: E402
+from gshell_mi.evaluation.mesh_scores import mesh_scores  # noqa: E402
 from gshell_mi.fit import FitConfig  # noqa: E402
 from gshell_mi.fit import stage as fit_stage  # noqa: E402
 from gshell_mi.fit.judge import Judge, Verdict, places_of  # noqa: E402
@@ -154,10 +155,7 @@ class Silent:
 
 def chamfer(vertices: np.ndarray, faces: np.ndarray, truth: trimesh.Trimesh) -> float:
     """Mean of both directions, in per cent of the truth's diagonal."""
-    points = [trimesh.sample.sample_surface(mesh, _POINTS, seed=seed)[0]
-              for seed, mesh in enumerate((trimesh.Trimesh(vertices, faces, process=False), truth))]
-    distances = [cKDTree(there).query(here)[0].mean() for here, there in (points, points[::-1])]
-    return float(50 * sum(distances) / np.linalg.norm(truth.extents))
+    return mesh_scores(trimesh.Trimesh(vertices, faces, process=False), truth, _POINTS)["chamfer"]
 
 
 def fitted_openings(path: Path, config: FitConfig) -> tuple[list[Change], Surface]:

@@ -109,12 +109,12 @@ class Judge:
         """
         places, views = 1 if label is None else max(int(label.max()) + 1, 1), len(self.views)
         most, sums = dr.opaque(mi.UInt32, views), [dr.zeros(mi.Float, places * views) for _ in range(3)]
+        where = where or before.shown
         with dr.suspend_grad():
             for split in range(len(self.splits)):
-                for pixel, place, first in self._judging(split, label, where or before.shown):
+                for pixel, place, first in self._judging(split, label, where):
                     errors = [self._error(split, pixel, *part.look(
-                        pixel, split, first if part.shown is (where or before.shown) else None))
-                        for part in (before, after)]
+                        pixel, split, first if part.shown is where else None)) for part in (before, after)]
                     for total, value in zip(sums, (mi.Float(1), *errors), strict=True):
                         dr.scatter_reduce(dr.ReduceOp.Add, total, value, place * most + pixel.view)
                     dr.eval(sums)

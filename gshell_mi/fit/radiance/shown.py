@@ -123,7 +123,12 @@ class Shown:
         self._faces = mi.Vector3u(np.ascontiguousarray(faces.T, np.uint32))
         self._normals = vertex_normals(self._positions, self._faces)
         self._offset = 1e-4 * float(np.ptp(vertices, axis=0).max())
-        self._smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
+
+    @cached_property
+    def _smooth(self) -> MeshDiffusion:
+        """Along the mesh. Who is only asked where rays meet it needs none."""
+        faces = self._faces.numpy().T
+        return MeshDiffusion(faces, dr.width(self._positions) // 3, _SMOOTHING)
 
     @property
     def mirrored(self) -> Mirrored:
@@ -144,7 +149,7 @@ class Shown:
     def _first_look(self) -> tuple[list[Mirrored], list[mi.Float]]:
         """What it mirrors, and the colours of all of it. Of most meshes no more is asked: no ray is kept."""
         with dr.suspend_grad():
-            telling = self._told()
+            telling = self.__dict__.get("_telling") or self._told()
             mirrors = self._like.mirrors if self._like else [self._mirrored_by(rays) for rays in telling]
             return mirrors, [self._mean_colors([(rays.met, rays.pixel.radiance)], mirrored)
                              for rays, mirrored in zip(telling, mirrors, strict=True)]
