@@ -123,6 +123,10 @@ class Shown:
         self._faces = mi.Vector3u(np.ascontiguousarray(faces.T, np.uint32))
         self._normals = vertex_normals(self._positions, self._faces)
         self._offset = 1e-4 * float(np.ptp(vertices, axis=0).max())
+        #: Mean length of an edge, and mean of the vertices, world units.
+        edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+        self.edge = float(np.linalg.norm(edges, axis=-1).mean())
+        self.middle = vertices.mean(axis=0)
 
     @cached_property
     def _smooth(self) -> MeshDiffusion:
