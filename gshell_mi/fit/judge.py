@@ -43,8 +43,9 @@ class Verdict:
 
     Attributes:
         before, after: (P,) mean error of a ray.
-        gain: (P,) mean, over the unseen views and both scales, of the logarithm of the error before over that
-            after: what is dark, or seen by some views far better than by others, counts as much as the rest.
+        gain: (P,) mean, over the unseen views, of the logarithm of the error before over that after, at the
+            scale that tells more: what is dark, or seen by some views far better than by
+            others, counts as much as the rest.
         noise: (P,) standard error of the gain; infinite where hardly a view tells. Views are independent of
             each other, rays of one view are not.
     """
@@ -70,10 +71,10 @@ class Judge:
 
     Before and after, each mesh has the mean colour that some views show it in, of one side and of the other,
     times what all of it mirrors, and others judge. What neither can explain so, such as texture finer than
-    the meshes, poses and noise, is in both errors. They are taken at two scales, of pixels and of the means
-    of small blocks, as noise and fine texture hide what pixels tell, and means what is patterned. A change
-    counts if the logarithm of their ratio, in the mean over scales and views, is above twice its standard
-    error.
+    the meshes, poses and noise, is in both errors. A change counts if the logarithm of their
+    ratio, in the mean over the views, is above twice its standard error. Two scales are asked, pixels and the
+    means of small blocks, and the one that tells more speaks: noise and fine texture hide what pixels tell,
+    and means hide what is patterned.
 
     Args:
         views, targets: the images. Pixels beside the masks' outlines do not count.
@@ -240,11 +241,14 @@ def verdict_of(rays: np.ndarray, before: np.ndarray, after: np.ndarray) -> Verdi
     # A view that hardly sees a place has hardly a say; one that sees much of it has one voice.
     weight = np.minimum(rays / mean, 1)
     per_ray = np.maximum(rays, 1)
-    change = np.log((before / per_ray + _EXACT) / (after / per_ray + _EXACT)).mean(axis=0)
+    change = np.log((before / per_ray + _EXACT) / (after / per_ray + _EXACT))
     voices = np.maximum(weight.sum(axis=1), 1e-12)
-    gain = (weight * change).sum(axis=1) / voices
-    spread = (weight**2 * (change - gain[:, None]) ** 2).sum(axis=1)
+    gain = (weight * change).sum(axis=-1) / voices
+    spread = (weight**2 * (change - gain[..., None]) ** 2).sum(axis=-1)
     noise = np.sqrt(spread * seen / np.maximum(seen - 1, 1)) / voices + _ROUNDED
+    # The scale that tells more of a place speaks for it.
+    scale = np.argmax(np.abs(gain) / noise, axis=0)[None]
+    gain, noise = (np.take_along_axis(values, scale, axis=0)[0] for values in (gain, noise))
     noise[seen < _VIEWS] = np.inf
     per_ray = np.maximum(total, 1)
     return Verdict(before[0].sum(axis=1) / per_ray, after[0].sum(axis=1) / per_ray, gain, noise)

@@ -39,6 +39,32 @@ def least_bent(vertices: np.ndarray, faces: np.ndarray, free: np.ndarray) -> np.
     return moved
 
 
+def dented(vertices: np.ndarray, faces: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """(V, 3) vertices of a mesh, pushed in at some places as deep as these are wide from rim to middle.
+
+    Args:
+        vertices, faces: of the mesh, oriented outwards.
+        place: (V,) which of the places a vertex is in, from 0; -1 if in none.
+    """
+    chosen, moved = np.flatnonzero(place >= 0), np.array(vertices, np.float64)
+    if not len(chosen):
+        return moved
+    # On a disc of radius R, the solution of Poisson's equation is (R^2 - r^2) / 4.
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    area = np.bincount(faces.ravel(), np.repeat(mesh.area_faces / 3, 3), len(vertices))
+    laplacian = mesh_laplacian(faces, len(vertices)).tocsc()[chosen][:, chosen]
+    height = np.maximum(spsolve(laplacian + _HELD * eye(len(chosen)), area[chosen]), 0)
+    label = place[chosen]
+    highest = np.zeros(label.max() + 1)
+    np.maximum.at(highest, label, height)
+    normals = np.zeros((len(highest), 3))
+    np.add.at(normals, label, mesh.vertex_normals[chosen] * area[chosen, None])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+    depth = 2 * height / np.sqrt(np.maximum(highest[label], 1e-12))
+    moved[chosen] -= depth[:, None] * normals[label]
+    return moved
+
+
 def put_in_place(sdf: np.ndarray, points: np.ndarray, moved: np.ndarray, faces: np.ndarray,
                  caps: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """A signed distance whose surface passes through caps that have moved, and is the same elsewhere.

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...fields.smoothing import MeshDiffusion
-from ...template.caps import least_bent, put_in_place
+from ...template.caps import dented, least_bent, put_in_place
 from ...template.msdf import clean_opacity, reopened, rewritten
 from ...template.sides import opposite_sides
 from ...topology import lobes
@@ -156,5 +156,13 @@ def _opened(fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray,
         return np.where(given, values, close_shallow(np.where(given, 1.0, cleaned), faces, thin))
 
     start = np.where(given, values, np.abs(proposed))
-    return justified(proposed, start, clean, lambda candidate: close_rejected(
+    values = justified(proposed, start, clean, lambda candidate: close_rejected(
         candidate, template, fit.judge, now, given))
+    opened = (values <= 0) & ~given
+    if not opened.any():
+        return values
+    # Where the surface fills a recess, whatever lies deeper explains more than it does.
+    place = places_of(opened, lobes(opened, faces))
+    dents = fit.judge.shown((dented(vertices, faces, place), faces), like=template)
+    deeper = fit.judge.compare(dents.part(np.where(given, values, 1.0)), template.part(values), place, template)
+    return np.where(opened & ~(deeper.gain > 0)[place], -values, values)
