@@ -7,7 +7,7 @@ from cap import cap
 
 from gshell_mi.extraction import extract
 from gshell_mi.lattice import TetLattice
-from gshell_mi.template.caps import least_bent, put_in_place
+from gshell_mi.template.caps import dented, least_bent, put_in_place
 
 RADIUS = 0.6
 
@@ -27,6 +27,19 @@ def test_nothing_is_free(ball):
 
 def test_without_surroundings_a_cap_stays_finite(ball):
     assert np.isfinite(least_bent(ball.vertices, ball.faces, np.ones(len(ball.vertices), bool))).all()
+
+
+def test_a_dent_is_about_as_deep_as_it_is_wide_from_rim_to_middle(ball):
+    """Where the ball is nearly flat."""
+    place = np.where(cap(ball, [0, 0, 1], 0.01), 0, np.where(cap(ball, [1, 0, 0], 0.02), 1, -1))
+    moved = dented(ball.vertices, ball.faces, place)
+    np.testing.assert_array_equal(moved[place < 0], ball.vertices[place < 0])
+    for index, axis in enumerate(np.eye(3)[[2, 0]]):
+        at = place == index
+        radius = np.linalg.norm(ball.vertices[at] - axis, axis=1).max()
+        depth = (ball.vertices - moved)[at] @ axis
+        assert depth.max() == pytest.approx(radius, rel=0.4) and depth.min() > 0
+        np.testing.assert_allclose(moved[at] + np.outer(depth, axis), ball.vertices[at], atol=0.02)
 
 
 @pytest.mark.parametrize("scale", [1.0, 100.0])

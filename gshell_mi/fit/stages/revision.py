@@ -164,5 +164,6 @@ def _opened(fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray,
     # Where the surface fills a recess, whatever lies deeper explains more than it does.
     place = places_of(opened, lobes(opened, faces))
     dents = fit.judge.shown((dented(vertices, faces, place), faces), like=template)
-    deeper = fit.judge.compare(dents.part(np.where(given, values, 1.0)), template.part(values), place, template)
+    holes = template.part(values)
+    deeper = fit.judge.compare(dents.part(np.where(given, values, 1.0)), holes, place, template)
     return np.where(opened & ~(deeper.gain > 0)[place], -values, values)

@@ -1,10 +1,13 @@
 """What is open after all, and what is not, is told by the images on the surface that there is."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from silent_steps import Silent
 
+from gshell_mi.fit.judge import Judge
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.hull import Hull
 from gshell_mi.fit.stages.revision import Revision
@@ -92,3 +95,19 @@ def test_a_bulge_that_is_open_closes_without_it(fit, opened):
 def vertices_of(fit, surface):
     """(V, 3) vertices of the surface."""
     return fit.scene.subject.surface_of(surface.fields).to_numpy()[0]
+
+
+def test_what_a_dent_explains_as_well_does_not_open(fit, hull, monkeypatch):
+    """The lid, if a dent in it were as good as what is seen through it."""
+    given, asked = Judge.compare, []
+
+    def compare(self, before, after, label=None, where=None):
+        verdict = given(self, before, after, label, where)
+        if before.shown is after.shown or where is not after.shown:
+            return verdict
+        asked.append(float(verdict.gain[0]))
+        return replace(verdict, gain=-np.abs(verdict.gain))
+
+    monkeypatch.setattr(Judge, "compare", compare)
+    _, changed = revised(fit, hull)
+    assert not changed and len(asked) == 1 and asked[0] > 0
