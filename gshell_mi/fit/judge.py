@@ -44,8 +44,8 @@ class Verdict:
     Attributes:
         before, after: (P,) mean error of a ray.
         gain: (P,) mean, over the unseen views, of the logarithm of the error before over that after, at the
-            scale that tells more: what is dark, or seen by some views far better than by
-            others, counts as much as the rest.
+            scale that tells more: what is dark, or seen by some views far better than by others, counts as
+            much as the rest.
         noise: (P,) standard error of the gain; infinite where hardly a view tells. Views are independent of
             each other, rays of one view are not.
     """
@@ -71,10 +71,10 @@ class Judge:
 
     Before and after, each mesh has the mean colour that some views show it in, of one side and of the other,
     times what all of it mirrors, and others judge. What neither can explain so, such as texture finer than
-    the meshes, poses and noise, is in both errors. A change counts if the logarithm of their
-    ratio, in the mean over the views, is above twice its standard error. Two scales are asked, pixels and the
-    means of small blocks, and the one that tells more speaks: noise and fine texture hide what pixels tell,
-    and means hide what is patterned.
+    the meshes, poses and noise, is in both errors. A change counts if the logarithm of their ratio, in the
+    mean over the views, is above twice its standard error. Two scales are asked, pixels and the means of
+    small blocks, and the one that tells more speaks: noise and fine texture hide what pixels tell, and means
+    hide what is patterned.
 
     Args:
         views, targets: the images. Pixels beside the masks' outlines do not count.

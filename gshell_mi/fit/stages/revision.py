@@ -4,7 +4,7 @@ They are first sought on a hull, before anything is known of exposures, cameras 
 that is wrong, what is seen through a true opening is explained no better than by its cap, and a false one
 may be right behind the surface. So the same radiance with opacity, and the same judge, are asked once more.
 An opening that explains unseen views no better than a cap does closes; what is proposed and explains them
-better opens; what nobody tells of stays as it is.
+better, also than a dent would, opens; what nobody tells of stays as it is.
 """
 
 from __future__ import annotations
