@@ -151,10 +151,9 @@ class Judge:
         """Columns and rows of blocks in each view, with sides of ``_BLOCK`` edges in the middle of meshes."""
         edge = np.mean([mesh.edge for mesh in shown])
         middle = np.mean([mesh.middle for mesh in shown], axis=0)
-        width, height = self.views.sizes.T
-        pixel = np.linalg.norm(self.views.bases[:, :, 0], axis=1) / width
+        pixel = self.views.pixel_size(dr.arange(mi.UInt32, len(self.views))).numpy()
         side = np.maximum(_BLOCK * edge / (pixel * np.linalg.norm(self.views.origins - middle, axis=1)), 1)
-        return mi.Vector2f(np.stack([width, height]) / side)
+        return mi.Vector2f(self.views.sizes.T / side)
 
     def _add_errors(self, sums: list[mi.Float], look: _Look, counts: mi.Vector2f, split: int) -> None:
         """Adds rays, and errors of pixels and of blocks, before and after, to those of places in views."""

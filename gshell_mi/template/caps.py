@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from ..conversion.mesh_distance import MeshFeet
 from ..fields.smoothing import mesh_laplacian
+from ..triangles import area_vectors, unit, vertex_areas
 
 #: What holds a cap without surroundings in place, as a share of what bends it.
 _HELD = 1e-6
@@ -49,19 +50,17 @@ def dented(vertices: np.ndarray, faces: np.ndarray, place: np.ndarray) -> np.nda
     chosen, moved = np.flatnonzero(place >= 0), np.array(vertices, np.float64)
     if not len(chosen):
         return moved
+    area = vertex_areas(vertices, faces)
     # On a disc of radius R, the solution of Poisson's equation is (R^2 - r^2) / 4.
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    area = np.bincount(faces.ravel(), np.repeat(mesh.area_faces / 3, 3), len(vertices))
     laplacian = mesh_laplacian(faces, len(vertices)).tocsc()[chosen][:, chosen]
     height = np.maximum(spsolve(laplacian + _HELD * eye(len(chosen)), area[chosen]), 0)
     label = place[chosen]
-    highest = np.zeros(label.max() + 1)
+    highest, normals = np.zeros(label.max() + 1), np.zeros((label.max() + 1, 3))
     np.maximum.at(highest, label, height)
-    normals = np.zeros((len(highest), 3))
-    np.add.at(normals, label, mesh.vertex_normals[chosen] * area[chosen, None])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
-    depth = 2 * height / np.sqrt(np.maximum(highest[label], 1e-12))
-    moved[chosen] -= depth[:, None] * normals[label]
+    at = place[faces]
+    np.add.at(normals, at[at >= 0], np.repeat(area_vectors(vertices, faces), 3, axis=0)[at.ravel() >= 0])
+    depth = 2 * height / np.sqrt(np.maximum(highest[label], np.finfo(float).tiny))
+    moved[chosen] -= depth[:, None] * unit(normals)[label]
     return moved
 
 
