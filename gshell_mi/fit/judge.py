@@ -157,9 +157,9 @@ class Judge:
 
     def _add_errors(self, sums: list[mi.Float], look: _Look, counts: mi.Vector2f, split: int) -> None:
         """Adds rays, and errors of pixels and of blocks, before and after, to those of places in views."""
-        first, block = look.blocks(counts)
-        rays = _group_sums(mi.Float(1), first, block)
-        target, *seen = (_group_sums(value, first, block) / rays
+        count, block = look.blocks(counts)
+        rays = _group_sums(mi.Float(1), count, block)
+        target, *seen = (_group_sums(value, count, block) / rays
                          for value in (look.target, look.before, look.after))
         at = look.place * dr.opaque(mi.UInt32, len(self.views)) + look.view
         one = dr.full(mi.Float, 1, dr.width(at))
@@ -201,22 +201,22 @@ class _Look:
         return cls(pixel.view, pixel.film, place, *(
             mi.Vector4f(*radiance, alpha) for radiance, alpha in ((pixel.radiance, pixel.alpha), *seen)))
 
-    def blocks(self, counts: mi.Vector2f) -> tuple[mi.UInt32, mi.UInt32]:
+    def blocks(self, counts: mi.Vector2f) -> tuple[int, mi.UInt32]:
         """Groups of the rays of one view and place that go through one block; ``counts`` of these per view.
 
         Returns:
-            A ray of each group, and the group of each ray.
+            How many groups there are, and the group of each ray.
         """
         column, row = self.film * dr.gather(mi.Vector2f, counts, self.view)
         numbers = np.stack([mi.UInt32(value).numpy() for value in (self.place, self.view, row, column)])
         key = np.ravel_multi_index(tuple(numbers.astype(np.int64)), tuple(numbers.max(axis=1) + 1))
-        _, first, group = np.unique(key, return_index=True, return_inverse=True)
-        return mi.UInt32(first.astype(np.uint32)), mi.UInt32(group.astype(np.uint32))
+        groups, group = np.unique(key, return_inverse=True)
+        return len(groups), mi.UInt32(group.astype(np.uint32))
 
 
-def _group_sums(values: mi.Float | mi.Vector4f, first: mi.UInt32, group: mi.UInt32) -> mi.Float | mi.Vector4f:
-    """Sums of the values of each group, of as many as there are in ``first``."""
-    sums = dr.zeros(type(values), dr.width(first))
+def _group_sums(values: mi.Float | mi.Vector4f, count: int, group: mi.UInt32) -> mi.Float | mi.Vector4f:
+    """Sums of the values of each of ``count`` groups."""
+    sums = dr.zeros(type(values), count)
     dr.scatter_reduce(dr.ReduceOp.Add, sums, values, group)
     return sums
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from bowl import RADIUS, half_sphere, write_fit_scene
+from bowl import RADIUS, half_sphere
 from scipy.spatial import Delaunay
 
 from gshell_mi.fit.judge import Judge, Verdict, verdict_of
@@ -30,8 +30,8 @@ def _with_lid() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_fit_scene(write_fit_scene(tmp_path_factory.mktemp("bowl"), views=24))
+def scene(bowl_scene):
+    return load_fit_scene(bowl_scene)
 
 
 def _verdict(scene, before, after, spoil=lambda rgba: rgba) -> Verdict:

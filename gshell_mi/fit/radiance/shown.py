@@ -123,16 +123,23 @@ class Shown:
         self._faces = mi.Vector3u(np.ascontiguousarray(faces.T, np.uint32))
         self._normals = vertex_normals(self._positions, self._faces)
         self._offset = 1e-4 * float(np.ptp(vertices, axis=0).max())
-        #: Mean length of an edge, and mean of the vertices, world units.
-        edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
-        self.edge = float(np.linalg.norm(edges, axis=-1).mean())
-        self.middle = vertices.mean(axis=0)
 
     @cached_property
     def _smooth(self) -> MeshDiffusion:
         """Along the mesh. Who is only asked where rays meet it needs none."""
         faces = self._faces.numpy().T
         return MeshDiffusion(faces, dr.width(self._positions) // 3, _SMOOTHING)
+
+    @cached_property
+    def edge(self) -> float:
+        """Mean length of an edge, world units."""
+        corners = self._positions.numpy().reshape(-1, 3)[self._faces.numpy().T]
+        return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).mean())
+
+    @cached_property
+    def middle(self) -> np.ndarray:
+        """(3,) mean of the vertices, world units."""
+        return self._positions.numpy().reshape(-1, 3).mean(axis=0)
 
     @property
     def mirrored(self) -> Mirrored:
