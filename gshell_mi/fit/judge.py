@@ -9,6 +9,7 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.stats import false_discovery_control, norm
 
 from ..pixels import PixelPool, PixelSample
 from ..targets import Target
@@ -24,8 +25,8 @@ _OUTLINE = 3
 #: colours at vertices can explain. Two of the T-shirt's openings are only told by them in noise of 0.05.
 _BLOCK = 4.0
 
-#: Standard errors by which a change has to be better.
-_SURE = 2.0
+#: Chance that what is accepted is an accident: two standard errors where one place is judged.
+_ACCIDENTS = float(norm.sf(2.0))
 
 #: Errors of this size are none.
 _EXACT = 1e-3
@@ -48,17 +49,29 @@ class Verdict:
             much as the rest.
         noise: (P,) standard error of the gain; infinite where hardly a view tells. Views are independent of
             each other, rays of one view are not.
+        rejected: how many more places of the same proposal were rejected before.
     """
 
     before: np.ndarray
     after: np.ndarray
     gain: np.ndarray
     noise: np.ndarray
+    rejected: int = 0
 
     @property
     def accepted(self) -> np.ndarray:
-        """(P,) whether the gain is no accident."""
-        return self.gain > _SURE * self.noise
+        """(P,) whether the gain is no accident.
+
+        Of many places one is better by chance. So of all that is accepted a fixed share may be accidents,
+        however many places are asked for (Benjamini and Hochberg 1995): a place alone needs two standard
+        errors, as the only one of 24 it needs three, and two again if all the others are better, too.
+        """
+        told = np.isfinite(self.noise)
+        accident = norm.sf(self.gain[told] / self.noise[told])
+        accepted = np.zeros(len(self.gain), bool)
+        family = false_discovery_control(np.append(accident, np.ones(self.rejected)))
+        accepted[told] = family[: len(accident)] < _ACCIDENTS
+        return accepted
 
     def facts(self) -> dict[str, list[float]]:
         """For ``metrics.json``: gain and noise of each place."""
@@ -72,9 +85,9 @@ class Judge:
     Before and after, each mesh has the mean colour that some views show it in, of one side and of the other,
     times what all of it mirrors, and others judge. What neither can explain so, such as texture finer than
     the meshes, poses and noise, is in both errors. A change counts if the logarithm of their ratio, in the
-    mean over the views, is above twice its standard error. Two scales are asked, pixels and the means of
-    small blocks, and the one that tells more speaks: noise and fine texture hide what pixels tell, and means
-    hide what is patterned.
+    mean over the views, is above twice its standard error, or more if many places are asked for. Two scales
+    are asked, pixels and the means of small blocks, and the one that tells more speaks: noise and fine
+    texture hide what pixels tell, and means hide what is patterned.
 
     Args:
         views, targets: the images. Pixels beside the masks' outlines do not count.

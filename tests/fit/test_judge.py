@@ -91,3 +91,30 @@ def test_few_views_are_not_enough():
     rays = np.zeros((1, 40))
     rays[:, :3] = 100
     assert not verdict_of(rays, 100.0 * (rays > 0), 10.0 * (rays > 0)).accepted
+
+
+def _told(z: list[float], rejected: int = 0) -> list[bool]:
+    gain = 0.1 * np.array(z)
+    return Verdict(gain, gain, gain, np.full(len(z), 0.1), rejected).accepted.tolist()
+
+
+def test_of_many_places_the_best_by_chance_is_not_accepted():
+    rng = np.random.default_rng(0)
+    chance = [sum(_told(rng.normal(size=24).tolist())) for _ in range(2000)]
+    # Each of them has a chance of 2.3 % to be above two standard errors, 43 % that one of 24 is.
+    assert np.mean(np.array(chance) > 0) == pytest.approx(0.0228, abs=0.01)
+
+
+def test_what_was_rejected_before_counts():
+    assert _told([2.1]) == [True]
+    assert _told([2.1], rejected=23) == [False]
+    assert _told([3.2], rejected=23) == [True]
+
+
+def test_many_places_that_are_all_better_are_all_accepted():
+    assert all(_told([2.1] * 24))
+
+
+def test_a_place_that_hardly_a_view_tells_of_makes_others_no_less_sure():
+    gain, noise = np.array([0.21] + 30 * [0.0]), np.array([0.1] + 30 * [np.inf])
+    assert Verdict(gain, gain, gain, noise).accepted.tolist() == [True] + 30 * [False]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 
@@ -73,11 +75,11 @@ def close_rejected(logits: np.ndarray, template: Shown, judge: Judge, before: Pa
     if (opened | given).all():
         # Nothing at all explains no image.
         return np.where(given, logits, -logits)
-    kept, trimmed = opened, np.zeros_like(opened)
+    kept, trimmed, closed = opened, np.zeros_like(opened), 0
     for closing in reversed(range(_CLOSINGS)):
         place = places_of(kept, lobes(kept, faces))
         after = template.part(np.where(kept | given, -np.abs(logits), np.abs(logits)))
-        verdict = judge.compare(before, after, place)
+        verdict = replace(judge.compare(before, after, place), rejected=closed)
         worst = ~verdict.accepted
         # The worst first; all where none is worse but some are not surely better, and in the last round.
         if closing:
@@ -86,6 +88,7 @@ def close_rejected(logits: np.ndarray, template: Shown, judge: Judge, before: Pa
         rejected = kept & worst[place]
         if not rejected.any():
             break
+        closed += np.count_nonzero(worst)
         anew = rejected & ~trimmed
         if closing and anew.any():
             anew &= _gains(judge, faces, before, after, anew) > 0
