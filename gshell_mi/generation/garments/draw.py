@@ -8,10 +8,12 @@ import drjit as dr
 import numpy as np
 import trimesh
 
+from ...arrays import Float
 from ...errors import UserError
 from ...extraction import extract
 from ...lattice import CubeLattice
 from ...topology import Topology, topology
+from .folds import folds, wrinkles
 from .kinds import KINDS
 
 #: Names of the classes of garments.
@@ -71,37 +73,21 @@ def _sewn(kind: str, parameters: dict[str, float], rng: np.random.Generator) -> 
     import mitsuba as mi
 
     lattice = CubeLattice(_CELLS)
+    points = mi.Point3f(lattice.points(mi.Float))
     given = {name: dr.opaque(mi.Float, value) for name, value in parameters.items()}
-    s, cut = KINDS[kind].fields(mi.Point3f(lattice.points(mi.Float)), given)
-    vertices, faces, _ = extract(lattice, s, cut).to_numpy()
+    s, cut = KINDS[kind].fields(points, given)
+    # A level set has no faces turned over, however sharply its normals turn; moved vertices would.
+    height = folds(points, given) + wrinkles(points, rng)
+    vertices, faces, _ = extract(lattice, s - height * _steepness(s, lattice), cut).to_numpy()
     if len(faces) == 0 or np.abs(vertices).max() > 0.999:  # it leaves the lattice
         return None
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    height = _folds(vertices, parameters) + _wrinkles(vertices, rng)
-    folded = vertices + height[:, None] * mesh.vertex_normals
-    return trimesh.Trimesh(_swayed(folded, rng), faces, process=False)
+    return trimesh.Trimesh(_swayed(vertices, rng), faces, process=False)
 
 
-def _folds(p: np.ndarray, given: dict[str, float]) -> np.ndarray:
-    """Height of the folds over the smooth cloth: waves around the y axis, deeper towards the hem."""
-    x, y, z = p.T
-    deep = np.clip((given["fold_top"] - y) / max(given["fold_top"] - given["fold_bottom"], 1e-3), 0, 1.2)
-    turn = np.arctan2(z, x)
-    phase = given["fold_count"] * turn + given["fold_phase"] + given["fold_turn"] * y
-    # A second number of waves makes no two folds alike.
-    second = np.sin((given["fold_count"] // 2 + 1) * turn + given["fold_second_phase"])
-    wave = np.sin(phase + 0.7 * given["fold_second"] * second) * (1 + 0.5 * given["fold_second"] * second)
-    return given["fold_depth"] * deep**1.5 * wave
-
-
-def _wrinkles(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Height of a few long waves in random directions."""
-    height = np.zeros(len(p))
-    for _ in range(4):
-        wave = rng.normal(size=3)
-        wave *= rng.uniform(4, 14) / np.linalg.norm(wave)
-        height += rng.uniform(0.001, 0.007) * np.sin(p @ wave + rng.uniform(0, 2 * np.pi))
-    return height
+def _steepness(s: Float, lattice: CubeLattice) -> Float:
+    """How much a field changes over a unit of length: 1 if it is a distance."""
+    grid = s.numpy().reshape((lattice.stride,) * 3)
+    return type(s)(np.linalg.norm(np.gradient(grid, lattice.spacing), axis=0).astype(np.float32).ravel())
 
 
 def _swayed(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
