@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from ..lifetime import end_with_parent
 from .pairs import pairs_of
 from .stationary import stationary_features
 
@@ -116,4 +117,5 @@ def _map(folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    end_with_parent()    # two of them in one folder would spoil it
     run(Path(sys.argv[1]))

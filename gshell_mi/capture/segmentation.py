@@ -1,8 +1,9 @@
 """Masks of photographs that come without: GrabCut in each view, tied across views by the hull they imply.
 
-A view is cut by its own colours: those outside the object's box are the background's, those where its
-sparse points are seen are the object's (Rother et al., GrabCut, SIGGRAPH 2004). What nearly all views call
-the object is its visual hull; its image in each view says what is certain there, and the views are cut anew.
+Where the floor behind the object is known, it tells what lies before it (see ``floor``). The rest of a view
+is cut by its own colours: those outside the object's box are the background's, those where its sparse points
+are seen are the object's (Rother et al., GrabCut, SIGGRAPH 2004). What nearly all views call the object is
+its visual hull; its image in each view says what is certain there, and the views are cut anew.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from scipy import ndimage
 
 from ..errors import UserError
 from .camera import Camera
+from .floor import floor_evidence
 from .parallel import in_order
 from .subject import Subject
 from .workspace import Progress
@@ -50,20 +52,23 @@ class View:
         camera: for this size.
         prior: (height, width) probability that a pixel is the object's, from a network or from a photograph
             of the background; None without one.
+        floor: (height, width) what is known from the floor, see ``floor.floor_evidence``; None if nothing.
     """
 
     image: np.ndarray
     camera: Camera
     prior: np.ndarray | None = None
+    floor: np.ndarray | None = None
 
     def reduced(self, by: int) -> View:
         """A copy of a fraction of the size."""
         if by == 1:
             return self
         size = (self.camera.width // by, self.camera.height // by)
-        prior = None if self.prior is None else _resized(self.prior, size)
+        prior, floor = (None if values is None else _resized(values, size)
+                        for values in (self.prior, self.floor))
         image = np.array(Image.fromarray(self.image).resize(size, Image.Resampling.BOX))
-        return View(image, self.camera.resized(*size), prior)
+        return View(image, self.camera.resized(*size), prior, floor)
 
 
 def _resized(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -101,6 +106,10 @@ def cut_out(views: list[View], subject: Subject, progress: Progress | None = Non
                 progress("masks", done, len(_ROUNDS) * len(views))
         return reduced, cuts
 
+    reduced = [view.reduced(_ROUNDS[0][0]) for view in views]
+    evidence = floor_evidence([view.image for view in reduced], [view.camera for view in reduced], subject)
+    views = [replace(view, floor=_resized(floor, view.image.shape[1::-1]))
+             for view, floor in zip(views, evidence, strict=True)]
     for _ in range(_GROWTHS):
         grid = _Voxels(subject, _ROUNDS[0][1])
         reduced, masks = cut(_ROUNDS[0][0], grid, None, [None] * len(views))
@@ -235,12 +244,19 @@ def _trimap(view: View, subject: Subject, grid: _Voxels, hull: np.ndarray | None
         if view.prior is not None:
             result[view.prior >= 0.5] = cv2.GC_PR_FGD
             result[view.prior < 0.5] = cv2.GC_PR_BGD
+        if view.floor is not None:
+            result[view.floor > 0.5] = cv2.GC_FGD
+            result[view.floor < -0.5] = cv2.GC_BGD
     else:
         image = grid.seen_by(camera, hull)
         band = _BAND * grid.pixels_per_voxel(camera)
         outside, inside = ndimage.distance_transform_edt(~image), ndimage.distance_transform_edt(image)
         result[mask] = cv2.GC_PR_FGD
         result[inside > band / 2] = cv2.GC_PR_FGD
+        if view.floor is not None:
+            result[view.floor > 0.5] = cv2.GC_PR_FGD
+            result[(view.floor > 0.5) & image] = cv2.GC_FGD
+            result[view.floor < -0.5] = cv2.GC_BGD
         result[inside > band] = cv2.GC_FGD
         result[outside > band] = cv2.GC_BGD
     result[~boxed] = cv2.GC_BGD

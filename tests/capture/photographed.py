@@ -39,8 +39,12 @@ _TABLE = _noise(1, 512, 1.5) + _noise(2, 512, 5)
 _BALL = _noise(3, 512, 2) + _noise(4, 512, 6)
 
 
-def photograph(camera: Camera, samples: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w, 3) uint8 photograph, reddish ball on bluish table, and (h, w) coverage."""
+def photograph(camera: Camera, samples: int = 2, *, plain: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """(h, w, 3) uint8 photograph, reddish ball on bluish table, and (h, w) coverage.
+
+    Args:
+        plain: the ball has one colour, which is one of the table's.
+    """
     n = samples
     v, u = (np.mgrid[:camera.height * n, :camera.width * n] + 0.5) / n
     ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
@@ -59,6 +63,8 @@ def photograph(camera: Camera, samples: int = 2) -> tuple[np.ndarray, np.ndarray
     on_table = 0.5 + 0.15 * _TABLE[cells[..., 0], cells[..., 1]]
     color = np.where(ball[..., None], on_ball[..., None] * [1.0, 0.5, 0.3],
                      on_table[..., None] * [0.4, 0.6, 1.0])
+    if plain:
+        color[ball] = [0.2, 0.3, 0.5]
     rgba = np.concatenate([np.clip(color, 0, 1), ball[..., None]], axis=-1)
     rgba = rgba.reshape(camera.height, n, camera.width, n, 4).mean(axis=(1, 3))
     return (rgba[..., :3] * 255 + 0.5).astype(np.uint8), rgba[..., 3]

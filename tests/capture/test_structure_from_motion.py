@@ -1,8 +1,12 @@
 """Cameras of photographs that come without."""
 
 import json
+import os
+import subprocess
 import sys
+import time
 from importlib.util import find_spec
+from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
@@ -21,6 +25,26 @@ from gshell_mi.scene import load_fit_scene
 
 needs_extras = pytest.mark.skipif(find_spec("pycolmap") is None or find_spec("cv2") is None,
                                   reason="needs the extras 'colmap' and 'masks'")
+
+
+def test_colmap_ends_with_a_command_that_is_killed(tmp_path):
+    """Or the same command, given again, would make it work in one folder twice."""
+    os.mkfifo(tmp_path / "job.json")    # it waits for what nobody writes
+    start = ("import subprocess, sys; worker = subprocess.Popen([sys.executable, '-m', "
+             "'gshell_mi.capture.colmap_worker', sys.argv[1]], stdout=subprocess.PIPE); "
+             "print(worker.pid, flush=True); worker.wait()")
+    pytest.importorskip("pycolmap", reason="needs the extra 'colmap'")
+    with subprocess.Popen([sys.executable, "-c", start, str(tmp_path)], stdout=subprocess.PIPE) as command:
+        worker = Path(f"/proc/{int(command.stdout.readline())}")
+        reader = os.open(tmp_path / "job.json", os.O_WRONLY)    # opens once the worker reads
+        assert worker.exists()
+        command.kill()
+    for _ in range(100):
+        if not worker.exists():
+            break
+        time.sleep(0.1)
+    os.close(reader)
+    assert not worker.exists()
 
 
 def tracks(cameras, points, rng):
