@@ -88,20 +88,10 @@ def floor_evidence(images: Sequence[np.ndarray], cameras: Sequence[Camera],
     if subject.floor is None:
         return [np.zeros(image.shape[:2], np.float32) for image in images]
     patch = _Patch.below(subject)
-    points = patch.points()
     images = [ndimage.gaussian_filter(image.astype(np.float32), (_BLUR, _BLUR, 0)) for image in images]
     few = -(-len(images) // _MOST)
-    seen = np.stack([_colors(image, camera, points, subject)
-                     for image, camera in zip(images[::few], cameras[::few], strict=True)])
-    told = np.isfinite(seen[..., 0]).sum(axis=0)
-    middle = np.maximum(told - 1, 0)[None, :, None] // 2    # NaN is sorted to the end
-    floor = np.take_along_axis(np.sort(seen, axis=0), middle, axis=0)[0]
-    off = np.abs(seen - floor).max(axis=2)
-    noise = max(1.5 * float(np.nanmedian(off)), _LEAST_NOISE)
-    agreed = (told >= _FEWEST) & ((off < _OTHER * noise).sum(axis=0) >= _AGREEING * told)
-    texture = floor.reshape(_TEXELS, _TEXELS, 3)
-    known = agreed.reshape(_TEXELS, _TEXELS) & _patterned(texture, noise)
-    texture = np.where(known[..., None], texture, np.nan)
+    texture, noise = _texture(np.stack([_colors(image, camera, patch.points(), subject) for image, camera in
+                                        zip(images[::few], cameras[::few], strict=True)]))
     found = []
     for image, camera in zip(images, cameras, strict=True):
         off = np.abs(image - _sampled(texture, patch.texel(camera))).max(axis=-1) / noise
@@ -110,6 +100,20 @@ def floor_evidence(images: Sequence[np.ndarray], cameras: Sequence[Camera],
         other = ndimage.minimum_filter(np.nan_to_num(off, nan=np.inf), 3) > _OTHER
         found.append(np.where(np.isnan(off), 0, np.where(alike, -1, other)).astype(np.float32))
     return found
+
+
+def _texture(seen: np.ndarray) -> tuple[np.ndarray, float]:
+    """What most images show of the floor, (``_TEXELS``, ``_TEXELS``, 3), NaN where they do not agree or would
+    anyway, and their noise; from what each shows, (images, texels, 3)."""
+    told = np.isfinite(seen[..., 0]).sum(axis=0)
+    middle = np.maximum(told - 1, 0)[None, :, None] // 2    # NaN is sorted to the end
+    median = np.take_along_axis(np.sort(seen, axis=0), middle, axis=0)[0]
+    off = np.abs(seen - median).max(axis=2)
+    noise = max(_LEAST_NOISE, 1.5 * float(np.nanmedian(off)) if told.any() else 0)
+    agreed = (told >= _FEWEST) & ((off < _OTHER * noise).sum(axis=0) >= _AGREEING * told)
+    texture = median.reshape(_TEXELS, _TEXELS, 3)
+    known = agreed.reshape(_TEXELS, _TEXELS) & _patterned(texture, noise)
+    return np.where(known[..., None], texture, np.nan), noise
 
 
 def _patterned(texture: np.ndarray, noise: float) -> np.ndarray:
