@@ -58,6 +58,19 @@ def test_an_opening_is_not_blamed_for_what_is_missing_behind_it(ball):
     np.testing.assert_array_equal(result <= 0, up)
 
 
+def test_the_best_of_many_has_to_be_better_than_one_alone(ball):
+    """An opening by 2.3 standard errors stays, but not as the only one of six that the images speak for."""
+    others = [cap(ball, direction, 0.02) for direction in np.vstack([np.eye(3), -np.eye(3)])[1:]]
+    first, wrong = cap(ball, [1, 0, 0], 0.02), np.any(others, axis=0)
+
+    def error(opaque):
+        return np.where(opaque, 1.0, np.where(wrong, 1.3, np.exp(-0.115)))
+
+    alone, _ = _closed(ball, np.where(first, -1.0, 1.0), error)
+    np.testing.assert_array_equal(alone <= 0, first)
+    assert (_closed(ball, np.where(first | wrong, -1.0, 1.0), error)[0] > 0).all()
+
+
 def test_many_rejected_openings_go_at_once_in_the_end(ball):
     directions = np.vstack([np.eye(3), -np.eye(3)])
     opened = np.any([cap(ball, direction, 0.02) for direction in directions], axis=0)

@@ -5,12 +5,15 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
+from cap import cap
+from scripted_judge import ScriptedJudge
 from silent_steps import Silent
 
 from gshell_mi.fit.judge import Judge
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.hull import Hull
-from gshell_mi.fit.stages.revision import Revision
+from gshell_mi.fit.stages.revision import Revision, _closed
 from gshell_mi.topology import topology
 
 #: Fewer steps and pixels, as so small images need.
@@ -90,6 +93,17 @@ def test_a_bulge_that_is_open_closes_without_it(fit, opened):
     mended, _ = revised(fit, torn)
     assert loops(fit, mended).boundary_loops == 1
     assert vertices_of(fit, mended)[:, 1].min() == pytest.approx(lowest, abs=lattice.spacing)
+
+
+@pytest.mark.parametrize(("better", "stays"), [(0.03, False), (0.08, True)])
+def test_an_opening_has_to_explain_more_by_its_noise(better, stays):
+    """By 0.6 and by 1.6 standard errors."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    opened = cap(ball, [0, 0, 1], 0.1)
+    judge = ScriptedJudge(len(ball.vertices), lambda opaque: np.exp(np.where(opaque, better, 0.0)))
+    values = np.where(opened, -1.0, 1.0)
+    closed = _closed(judge, judge.shown((ball.vertices, ball.faces)), values, np.full(len(values), -1))
+    np.testing.assert_array_equal(closed <= 0, opened & stays)
 
 
 def vertices_of(fit, surface):
