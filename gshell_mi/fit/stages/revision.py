@@ -36,8 +36,9 @@ _CLOSINGS = 7
 _SURE = 0.5
 
 #: Standard errors, at each scale, by which an opening has to explain more than a cap: half of what it takes
-#: to open one. The chair's false slit has .6 for pixels, and 2.2 for blocks, of which it has two a view; true
-#: openings of T-shirt, chair and lace have 1.8 to 13.
+#: to open one. The chair's false slit had .6 for pixels, and 2.2 for blocks, of which it has two a view (in
+#: another fit 3.0 and 3.7, so this does not close it always); true openings of T-shirt, chair and lace have
+#: 1.8 to 13.
 _STANDING = 1.0
 
 #: Lambda that smooths new rims along the template.
