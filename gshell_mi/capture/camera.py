@@ -109,6 +109,12 @@ class Camera:
         seen = self.distortion.apply(ideal) if self.distortion else ideal
         return seen * [self.fx, self.fy] + [self.cx, self.cy]
 
+    def project_front(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel coordinates (n, 2) of world points (n, 3), and (n,) whether they are before the camera; those
+        that are not have the coordinates of the optical axis."""
+        front = (points - self.center) @ self.forward > 1e-9
+        return self.project(np.where(front[:, None], points, self.center + self.forward)), front
+
     def basis(self) -> np.ndarray:
         """(3, 3) matrix from the film position (u, v, 1), u and v in [0, 1], to a world direction of depth 1.
 

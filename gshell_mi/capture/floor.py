@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from ..triangles import unit
 from .camera import Camera
 from .subject import Subject
 
@@ -52,8 +53,7 @@ class _Patch:
         assert subject.floor is not None
         normal, offset = subject.floor[:3], subject.floor[3]
         middle = subject.box.mean(axis=0)
-        first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-        first /= np.linalg.norm(first)
+        first = unit(np.cross(normal, np.eye(3)[np.abs(normal).argmin()]))
         half = _REACH * np.ptp(subject.box, axis=0).max()
         return cls(middle - (middle @ normal + offset) * normal,
                    half * np.stack([first, np.cross(normal, first)]))
@@ -90,7 +90,8 @@ def floor_evidence(images: Sequence[np.ndarray], cameras: Sequence[Camera],
     patch = _Patch.below(subject)
     images = [ndimage.gaussian_filter(image.astype(np.float32), (_BLUR, _BLUR, 0)) for image in images]
     few = -(-len(images) // _MOST)
-    texture, noise = _texture(np.stack([_colors(image, camera, patch.points(), subject) for image, camera in
+    points = patch.points()
+    texture, noise = _texture(np.stack([_colors(image, camera, points, subject) for image, camera in
                                         zip(images[::few], cameras[::few], strict=True)]))
     found = []
     for image, camera in zip(images, cameras, strict=True):
@@ -140,15 +141,11 @@ def _directions(camera: Camera) -> np.ndarray:
 
 def _colors(image: np.ndarray, camera: Camera, points: np.ndarray, subject: Subject) -> np.ndarray:
     """(n, 3) what an image shows at points; NaN beyond its frame, and behind the subject's core."""
-    to_point = points - camera.center
-    front = to_point @ camera.forward > 1e-9
-    u, v = camera.project(np.where(front[:, None], points, camera.center + camera.forward)).T
-    free = front
+    (u, v), free = (values.T for values in camera.project_front(points))
     if subject.core is not None:
         center, radius = subject.core
-        ray = to_point / np.linalg.norm(to_point, axis=1, keepdims=True)
-        to_core = center - camera.center
-        free = free & (np.linalg.norm(np.cross(ray, to_core), axis=1) > radius)
+        ray = unit(points - camera.center)
+        free = free & (np.linalg.norm(np.cross(ray, center - camera.center), axis=1) > radius)
     at = np.stack([v, u]).reshape(2, _TEXELS, _TEXELS) - 0.5
     return np.where(free[:, None], _sampled(image, at).reshape(-1, 3), np.nan)
 

@@ -165,9 +165,7 @@ class _Voxels:
 
     def pixels(self, camera: Camera, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rows and columns of the chosen voxels' centres, and whether the frame holds them."""
-        points = self.points[which]
-        front = (points - camera.center) @ camera.forward > 1e-9
-        u, v = camera.project(np.where(front[:, None], points, camera.center + camera.forward)).T
+        (u, v), front = (values.T for values in camera.project_front(self.points[which]))
         framed = front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
         return np.where(framed, v, 0).astype(int), np.where(framed, u, 0).astype(int), framed
 

@@ -29,11 +29,11 @@ needs_extras = pytest.mark.skipif(find_spec("pycolmap") is None or find_spec("cv
 
 def test_colmap_ends_with_a_command_that_is_killed(tmp_path):
     """Or the same command, given again, would make it work in one folder twice."""
+    pytest.importorskip("pycolmap", reason="needs the extra 'colmap'")
     os.mkfifo(tmp_path / "job.json")    # it waits for what nobody writes
     start = ("import subprocess, sys; worker = subprocess.Popen([sys.executable, '-m', "
              "'gshell_mi.capture.colmap_worker', sys.argv[1]], stdout=subprocess.PIPE); "
              "print(worker.pid, flush=True); worker.wait()")
-    pytest.importorskip("pycolmap", reason="needs the extra 'colmap'")
     with subprocess.Popen([sys.executable, "-c", start, str(tmp_path)], stdout=subprocess.PIPE) as command:
         worker = Path(f"/proc/{int(command.stdout.readline())}")
         reader = os.open(tmp_path / "job.json", os.O_WRONLY)    # opens once the worker reads
