@@ -27,7 +27,7 @@ from ...template.sides import opposite_sides
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from ..judge import Judge
-from ..radiance.acceptance import close_rejected, close_shallow, open_rejected
+from ..radiance.acceptance import close_recesses, close_rejected, close_shallow, open_rejected
 from ..radiance.shown import Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
@@ -195,6 +195,7 @@ def find_openings(appearance: SurfaceRadiance, template: Shown, judge: Judge, ro
         logits = np.where(opened, _OPEN, np.abs(smoothed))
         logits = clean(justified(smoothed, logits, clean, lambda candidate: open_rejected(
             clean(close_rejected(candidate, template, judge, template.whole)), template, judge)))
+        logits = clean(close_recesses(logits, template, judge, template.part(logits), opened))
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
         unjustified |= (proposed <= 0) & (logits > 0)
