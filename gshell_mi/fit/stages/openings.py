@@ -195,9 +195,9 @@ def find_openings(appearance: SurfaceRadiance, template: Shown, judge: Judge, ro
         logits = np.where(opened, _OPEN, np.abs(smoothed))
         logits = clean(justified(smoothed, logits, clean, lambda candidate: open_rejected(
             clean(close_rejected(candidate, template, judge, template.whole)), template, judge)))
-        logits = clean(close_recesses(logits, template, judge, template.part(logits), opened))
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
+        logits = clean(close_recesses(logits, template, judge, template.part(logits)))
         unjustified |= (proposed <= 0) & (logits > 0)
         # Rims differ a little each time.
         further = clean(np.where((logits <= 0) & ~opened, -1.0, 1.0)) <= 0
