@@ -20,12 +20,11 @@ class ScriptedJudge:
         self.count, self.error, self.noise = count, error, noise
         self.asked: list[np.ndarray] = []
 
-    def shown(self, mesh: Mesh, like: "ScriptedTemplate | None" = None) -> "ScriptedTemplate":
-        """The template, or with dents, which explain what a closed one does."""
+    def shown(self, mesh: Mesh) -> "ScriptedTemplate":
+        """The template."""
         return ScriptedTemplate(mesh, self)
 
-    def compare(self, before: np.ndarray, after: np.ndarray, label: np.ndarray,
-                where: "ScriptedTemplate | None" = None) -> Verdict:
+    def compare(self, before: np.ndarray, after: np.ndarray, label: np.ndarray) -> Verdict:
         """By the mean errors of each place's vertices."""
         told = label >= 0
         number = np.maximum(np.bincount(label[told]), 1)

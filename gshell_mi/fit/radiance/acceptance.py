@@ -8,7 +8,6 @@ import mitsuba as mi
 import numpy as np
 
 from ...fields.smoothing import MeshDiffusion
-from ...template.caps import dented
 from ...topology import equal_patches, lobes, patch_sizes, vertex_components
 from ..judge import Judge, places_of
 from .shown import Part, Shown
@@ -103,31 +102,6 @@ def close_rejected(logits: np.ndarray, template: Shown, judge: Judge, before: Pa
         if not kept.any():
             break
     return np.where(opened & ~kept, -logits, logits)
-
-
-def close_recesses(logits: np.ndarray, template: Shown, judge: Judge, after: Part,
-                   given: np.ndarray | None = None) -> np.ndarray:
-    """Closes the openings that do not explain unseen views better than a dent as deep as they are wide.
-
-    Where the surface fills a recess, as a hull does below a chair's rail, whatever lies deeper explains more
-    than it does. What is open in truth is deeper than any dent.
-
-    Args:
-        logits, template, judge, given: as of ``close_rejected``.
-        after: the template with the openings.
-
-    Returns:
-        (V,) logits, those of rejected openings negated.
-    """
-    vertices, faces = template.mesh
-    opened = (logits <= 0) if given is None else (logits <= 0) & ~given
-    if not opened.any():
-        return logits
-    place = places_of(opened, lobes(opened, faces))
-    dents = judge.shown((dented(vertices, faces, place), faces), like=template)
-    closed = np.ones_like(logits) if given is None else np.where(given, -1.0, 1.0)
-    accepted = judge.compare(dents.part(closed), after, place, template).accepted
-    return np.where(opened & ~accepted[place], -logits, logits)
 
 
 def open_rejected(logits: np.ndarray, template: Shown, judge: Judge) -> np.ndarray:

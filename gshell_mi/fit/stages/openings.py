@@ -27,7 +27,7 @@ from ...template.sides import opposite_sides
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from ..judge import Judge
-from ..radiance.acceptance import close_recesses, close_rejected, close_shallow, open_rejected
+from ..radiance.acceptance import close_rejected, close_shallow, open_rejected
 from ..radiance.shown import Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
@@ -197,7 +197,6 @@ def find_openings(appearance: SurfaceRadiance, template: Shown, judge: Judge, ro
             clean(close_rejected(candidate, template, judge, template.whole)), template, judge)))
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
-        logits = clean(close_recesses(logits, template, judge, template.part(logits)))
         unjustified |= (proposed <= 0) & (logits > 0)
         # Rims differ a little each time.
         further = clean(np.where((logits <= 0) & ~opened, -1.0, 1.0)) <= 0
