@@ -35,6 +35,7 @@ generate: $(VENV)/.generate $(VENV)/.llvm
 
 test: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) -m ruff check --quiet .
+	@$(PY) -m ruff format --check --quiet . || { echo "Run $(PY) -m ruff format ."; exit 1; }
 	@$(PY) -m basedpyright --pythonpath $(PY)
 	@$(PY) -m pytest $(ARGS)
 

@@ -12,10 +12,18 @@ import mitsuba as mi
 import pytest
 
 # Modules that cannot be imported without the extra "generate": their own tests say that they are skipped.
-collect_ignore = [] if find_spec("torch") and find_spec("monai") else [
-    "gshell_mi/generation/models",
-    *(str(path) for path in Path(__file__).parent.glob("gshell_mi/generation/*.py")
-      if re.search(r"^(from|import) (torch|monai)\b", path.read_text(encoding="utf-8"), re.MULTILINE))]
+collect_ignore = (
+    []
+    if find_spec("torch") and find_spec("monai")
+    else [
+        "gshell_mi/generation/models",
+        *(
+            str(path)
+            for path in Path(__file__).parent.glob("gshell_mi/generation/*.py")
+            if re.search(r"^(from|import) (torch|monai)\b", path.read_text(encoding="utf-8"), re.MULTILINE)
+        ),
+    ]
+)
 
 
 def pytest_addoption(parser):

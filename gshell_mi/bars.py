@@ -24,8 +24,9 @@ class Bars(Progress):
 
     def __init__(self, *columns: str | ProgressColumn, quiet: bool = False, transient: bool = False):
         console = Console(stderr=True, highlight=False)
-        super().__init__(*columns, console=console, transient=transient,
-                         disable=quiet or not console.is_terminal)
+        super().__init__(
+            *columns, console=console, transient=transient, disable=quiet or not console.is_terminal
+        )
         self._in_lines, self._told = not quiet and not console.is_terminal, -math.inf
 
     def update(self, task_id: TaskID, **changes: Any) -> None:
@@ -44,6 +45,9 @@ class Bars(Progress):
             return
         self._told = now
         task = next(task for task in self.tasks if task.id == task_id)
-        texts = (str(column if isinstance(column, str) else column.render(task)) for column in self.columns
-                 if not isinstance(column, BarColumn))
+        texts = (
+            str(column if isinstance(column, str) else column.render(task))
+            for column in self.columns
+            if not isinstance(column, BarColumn)
+        )
         self.console.print(" ".join(text for text in texts if text), soft_wrap=True)

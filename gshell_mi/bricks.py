@@ -112,8 +112,10 @@ class Lookup:
         weight; the lowest two of the random bits are not used."""
         scale, last = 0.5 * mi.Float(self.side), self.side - 1
         uniform = (mi.Float((bits >> shift) & 0x3FF) / 1024 for shift in (2, 12, 22))
-        x, y, z = (dr.clip(mi.Int32(dr.floor((p + 1) * scale - 0.5 + u)), 0, last)
-                   for p, u in zip(position, uniform, strict=True))
+        x, y, z = (
+            dr.clip(mi.Int32(dr.floor((p + 1) * scale - 0.5 + u)), 0, last)
+            for p, u in zip(position, uniform, strict=True)
+        )
         return self.voxel(x, y, z, active)
 
     def around(self, position: mi.Point3f, active: mi.Bool) -> list[tuple[mi.Int32, mi.Float]]:

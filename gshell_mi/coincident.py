@@ -36,14 +36,16 @@ def coincident_meshes(shapes: Iterable[mi.Shape]) -> list[str]:
         positions = np.array(parameters["vertex_positions"]).reshape(-1, 3)
         corners.append(positions[np.array(parameters["faces"]).reshape(-1, 3)])
         owner.append(np.full(len(corners[-1]), number))
-    points = np.concatenate(corners).reshape(-1, 3) + 0.0    # 0.0 and -0.0 are one place
+    points = np.concatenate(corners).reshape(-1, 3) + 0.0  # 0.0 and -0.0 are one place
     vertex = np.unique(points, axis=0, return_inverse=True)[1].reshape(-1, 3)
     faces, owner = np.sort(vertex, axis=1), np.concatenate(owner)
-    whole = (np.diff(faces, axis=1) > 0).all(axis=1)    # a gshell's padding is no face
+    whole = (np.diff(faces, axis=1) > 0).all(axis=1)  # a gshell's padding is no face
     faces, owner = faces[whole], owner[whole]
     _, first, same = np.unique(faces, axis=0, return_index=True, return_inverse=True)
     before = owner[first[same.ravel()]]
     pairs = Counter(zip(owner[before != owner].tolist(), before[before != owner].tolist(), strict=True))
-    return [f"Mesh '{meshes[own].id()}' has {counted(count, 'face')} that lie in faces of mesh "
-            f"'{meshes[other].id()}': derivatives count their silhouettes twice; leave one of the two out."
-            for (own, other), count in sorted(pairs.items())]
+    return [
+        f"Mesh '{meshes[own].id()}' has {counted(count, 'face')} that lie in faces of mesh "
+        f"'{meshes[other].id()}': derivatives count their silhouettes twice; leave one of the two out."
+        for (own, other), count in sorted(pairs.items())
+    ]

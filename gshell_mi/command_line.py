@@ -17,10 +17,17 @@ from .streams import with_streams
 Arguments = TypeVar("Arguments")
 
 
-def run_command(name: str, description: str, arguments: type[Arguments], work: Callable[[Arguments], None],
-                given: list[str] | None, *, default: Arguments | None = None,
-                check: Callable[[list[str]], None] = lambda words: None,
-                interrupted: Callable[[Arguments], str] = lambda _: "Interrupted.") -> int:
+def run_command(
+    name: str,
+    description: str,
+    arguments: type[Arguments],
+    work: Callable[[Arguments], None],
+    given: list[str] | None,
+    *,
+    default: Arguments | None = None,
+    check: Callable[[list[str]], None] = lambda words: None,
+    interrupted: Callable[[Arguments], str] = lambda _: "Interrupted.",
+) -> int:
     """Parses the arguments, sets their Mitsuba variant, if they have one, and does the work.
 
     Args:
@@ -37,10 +44,17 @@ def run_command(name: str, description: str, arguments: type[Arguments], work: C
     Returns:
         The exit code: 0, 2 after a user's mistake (told on stderr in one sentence), 130 after Ctrl-C.
     """
+
     def run() -> int:
         check(sys.argv[1:] if given is None else given)
-        parse = partial(tyro.cli, arguments, args=given, prog=f"python -m gshell_mi.{name}",
-                        description=description, config=(tyro.conf.FlagCreatePairsOff,))
+        parse = partial(
+            tyro.cli,
+            arguments,
+            args=given,
+            prog=f"python -m gshell_mi.{name}",
+            description=description,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
         parsed = parse() if default is None else parse(default=default)
         with Interrupt() as interrupt:
             try:

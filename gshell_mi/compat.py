@@ -21,8 +21,14 @@ import numpy as np
 DRJIT_VERSION = tuple(int(part) for part in dr.__version__.split(".")[:2])
 
 #: Integrators that Mitsuba registers from Python; all its other plugins are libraries in its folder.
-MITSUBA_INTEGRATORS = ("prb", "prb_basic", "prb_projective", "prbvolpath", "direct_projective",
-                       "volprim_rf_basic")
+MITSUBA_INTEGRATORS = (
+    "prb",
+    "prb_basic",
+    "prb_projective",
+    "prbvolpath",
+    "direct_projective",
+    "volprim_rf_basic",
+)
 
 
 def mitsuba_folder() -> Path:
@@ -52,7 +58,7 @@ def without_chatter() -> Iterator[None]:
             try:
                 stream.flush()
                 kept = os.dup(number)
-            except (OSError, ValueError, AttributeError):    # closed: there is nobody to disturb
+            except (OSError, ValueError, AttributeError):  # closed: there is nobody to disturb
                 continue
             stack.callback(os.close, kept)
             stack.callback(os.dup2, kept, number)
@@ -93,8 +99,13 @@ def to_world(props: mi.Properties) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f(props.get("to_world", mi.ScalarTransform4f()).matrix)
 
 
-def write_mesh(mesh: mi.Mesh, positions: mi.Float, faces: mi.UInt32, normals: mi.Float | None = None,
-               **attributes: mi.Float) -> list[str]:
+def write_mesh(
+    mesh: mi.Mesh,
+    positions: mi.Float,
+    faces: mi.UInt32,
+    normals: mi.Float | None = None,
+    **attributes: mi.Float,
+) -> list[str]:
     """Replaces the buffers of a mesh, whose sizes may change, and lets it update itself.
 
     Args:
@@ -125,8 +136,11 @@ def drop_vertex_normals(mesh: mi.Mesh) -> None:
 def triangle_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> mi.Mesh:
     """A mesh of (V, 3) positions and (F, 3) indices, shaded with face normals."""
     mesh = mi.Mesh(name, len(vertices), len(faces))
-    write_mesh(mesh, mi.Float(np.ascontiguousarray(vertices, np.float32).ravel()),
-               mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel()))
+    write_mesh(
+        mesh,
+        mi.Float(np.ascontiguousarray(vertices, np.float32).ravel()),
+        mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel()),
+    )
     return mesh
 
 
@@ -136,9 +150,13 @@ def mesh_scene(vertices: np.ndarray, faces: np.ndarray) -> mi.Scene:
     The mesh is an instance: on the CPU, Mitsuba splits triangles for the BVH of a scene, but not for that
     of a group, which is built three times as fast; rays are as fast in either.
     """
-    return mi.load_dict({"type": "scene",
-                         "group": {"type": "shapegroup", "mesh": triangle_mesh("mesh", vertices, faces)},
-                         "instance": {"type": "instance", "shapegroup": {"type": "ref", "id": "group"}}})
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "group": {"type": "shapegroup", "mesh": triangle_mesh("mesh", vertices, faces)},
+            "instance": {"type": "instance", "shapegroup": {"type": "ref", "id": "group"}},
+        }
+    )
 
 
 def move_mesh(scene: mi.Scene, positions: mi.Float) -> None:

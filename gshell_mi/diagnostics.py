@@ -50,27 +50,41 @@ class Diagnostics:
         if not self.pieces:
             found.append("no surface is left: look at views/, and check cameras and masks.")
         if self.floaters:
-            found.append(f"{counted(self.floaters, 'loose piece')} of less than 2 % of the area: raise "
-                         f"--topology.min-area, or add --losses.extra sdf_sign 0.002, or delete in Blender.")
+            found.append(
+                f"{counted(self.floaters, 'loose piece')} of less than 2 % of the area: raise "
+                f"--topology.min-area, or add --losses.extra sdf_sign 0.002, or delete in Blender."
+            )
         if self.pieces > 1:
-            found.append(f"the surface is in {self.pieces} pieces: if the object is in one, its thin parts "
-                         f"were lost; raise --resolution.")
+            found.append(
+                f"the surface is in {self.pieces} pieces: if the object is in one, its thin parts "
+                f"were lost; raise --resolution."
+            )
         if self.pinholes:
-            found.append(f"{counted(self.pinholes, 'pin-hole')} beside "
-                         f"{counted(self.boundary_loops, 'boundary loop')}: add --losses.extra hole_closing "
-                         f"1, or raise --topology.min-area.")
+            found.append(
+                f"{counted(self.pinholes, 'pin-hole')} beside "
+                f"{counted(self.boundary_loops, 'boundary loop')}: add --losses.extra hole_closing "
+                f"1, or raise --topology.min-area."
+            )
         if self.self_contact > CONTACT_LIMIT:
-            found.append(f"{100 * self.self_contact:.0f} % of the surface is within a cell of another sheet "
-                         f"of its template, where details merge: raise --resolution.")
+            found.append(
+                f"{100 * self.self_contact:.0f} % of the surface is within a cell of another sheet "
+                f"of its template, where details merge: raise --resolution."
+            )
         if self.unobserved > UNOBSERVED_LIMIT and self.unobserved_center:
             x, y, z = self.unobserved_center
-            found.append(f"{100 * self.unobserved:.0f} % of the surface is seen by no view and is a guess: "
-                         f"add views of the parts around ({x:.2f}, {y:.2f}, {z:.2f}).")
+            found.append(
+                f"{100 * self.unobserved:.0f} % of the surface is seen by no view and is a guess: "
+                f"add views of the parts around ({x:.2f}, {y:.2f}, {z:.2f})."
+            )
         return found
 
 
-def diagnose(surface: tuple[np.ndarray, np.ndarray], template: tuple[np.ndarray, np.ndarray],
-             views: PinholeViews, cell: float) -> Diagnostics:
+def diagnose(
+    surface: tuple[np.ndarray, np.ndarray],
+    template: tuple[np.ndarray, np.ndarray],
+    views: PinholeViews,
+    cell: float,
+) -> Diagnostics:
     """Looks for floaters, pin-holes, self-contact and unobserved area.
 
     Args:
@@ -104,8 +118,15 @@ def diagnose(surface: tuple[np.ndarray, np.ndarray], template: tuple[np.ndarray,
     total = max(area.sum(), 1e-30)
     x, y, z = unseen @ centers / max(unseen.sum(), 1e-30)
     center = (float(x), float(y), float(z)) if unseen.any() else None
-    return Diagnostics(counts.components - floaters, floaters, counts.boundary_loops, counts.pinholes,
-                       float(area[touching].sum() / total), float(unseen.sum() / total), center)
+    return Diagnostics(
+        counts.components - floaters,
+        floaters,
+        counts.boundary_loops,
+        counts.pinholes,
+        float(area[touching].sum() / total),
+        float(unseen.sum() / total),
+        center,
+    )
 
 
 def _floaters(vertex_count: int, faces: np.ndarray, area: np.ndarray) -> int:
@@ -115,8 +136,9 @@ def _floaters(vertex_count: int, faces: np.ndarray, area: np.ndarray) -> int:
     return int(((areas > 0) & (areas < FLOATER * area.sum())).sum())
 
 
-def _touching(centers: np.ndarray, normals: np.ndarray, template: tuple[np.ndarray, np.ndarray],
-              cell: float) -> np.ndarray:
+def _touching(
+    centers: np.ndarray, normals: np.ndarray, template: tuple[np.ndarray, np.ndarray], cell: float
+) -> np.ndarray:
     """Which points of the template have another sheet of it within a cell, before or behind them."""
     scene = mesh_scene(*template)
     origin, normal = _vectors(mi.Point3f, centers), _vectors(mi.Vector3f, normals)

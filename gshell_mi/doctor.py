@@ -151,8 +151,10 @@ def _llvm_problem() -> str | None:
     chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
     if found is None:
         if chosen:
-            return (f"DRJIT_LIBLLVM_PATH is set to {chosen!r}, which Dr.Jit cannot load as LLVM: "
-                    "correct the path or unset the variable")
+            return (
+                f"DRJIT_LIBLLVM_PATH is set to {chosen!r}, which Dr.Jit cannot load as LLVM: "
+                "correct the path or unset the variable"
+            )
         return f"Dr.Jit found no LLVM library: {_INSTALL_LLVM}"
     if found[0] < MINIMUM_LLVM:
         path = _llvm_path() or "a path that the system does not tell"
@@ -175,12 +177,15 @@ def _run_self_test(found: Diagnosis) -> tuple[Diagnosis, str | None]:
         reason = next((line for line in lines if line.startswith("LLVM ERROR")), None)
         if reason:
             return found, f"the self-test's render failed ({reason}): {_INSTALL_LLVM}"
-        return found, (f"the self-test's render failed ({lines[-1]}): `python -m gshell_mi.doctor --render` "
-                       "shows the whole message")
+        return found, (
+            f"the self-test's render failed ({lines[-1]}): `python -m gshell_mi.doctor --render` "
+            "shows the whole message"
+        )
     answer = json.loads(result.stdout.strip().splitlines()[-1])
     if abs(answer["value"] - _EXPECTED) > 0.01:
-        return found, (f"the self-test rendered {answer['value']:.3f} where {_EXPECTED} is right: "
-                       f"{_INSTALL_LLVM}")
+        return found, (
+            f"the self-test rendered {answer['value']:.3f} where {_EXPECTED} is right: {_INSTALL_LLVM}"
+        )
     return replace(found, render_seconds=answer["seconds"]), None
 
 
@@ -189,15 +194,24 @@ def _render() -> dict[str, float]:
     mi.set_variant("llvm_ad_rgb")
     look_down = mi.ScalarTransform4f().look_at(origin=[0, 0, 2], target=[0, 0, 0], up=[0, 1, 0])
     start = time.perf_counter()
-    scene = mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 3},
-        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(10),
-                  "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": _EXPECTED}}},
-        "light": {"type": "constant"},
-        "sensor": {"type": "perspective", "fov": 40, "to_world": look_down,
-                   "film": {"type": "hdrfilm", "width": 64, "height": 64}},
-    })
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 3},
+            "floor": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale(10),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": _EXPECTED}},
+            },
+            "light": {"type": "constant"},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": look_down,
+                "film": {"type": "hdrfilm", "width": 64, "height": 64},
+            },
+        }
+    )
     image = mi.render(scene, spp=64)
     # Dr.Jit's NaN-propagating minimum is what old LLVM versions cannot compile.
     value = dr.mean(dr.minimum(image.array, 10.0))[0]

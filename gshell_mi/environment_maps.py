@@ -29,11 +29,15 @@ def read_environment_map(path: Path, name: str) -> np.ndarray:
         pixels, channels = read_float_image(path)
     except Exception as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-        raise UserError(f"{name} '{path}' cannot be read as an image ({reason}); give a latitude-longitude "
-                        f"environment map such as an OpenEXR file.") from error
+        raise UserError(
+            f"{name} '{path}' cannot be read as an image ({reason}); give a latitude-longitude "
+            f"environment map such as an OpenEXR file."
+        ) from error
     if bad := first_not_finite(pixels):
-        raise UserError(f"{name} '{path}' holds NaN or infinity (first at column {bad[0]}, row {bad[1]}); "
-                        f"mend those pixels, or clamp a sun beyond what half floats hold.")
+        raise UserError(
+            f"{name} '{path}' holds NaN or infinity (first at column {bad[0]}, row {bad[1]}); "
+            f"mend those pixels, or clamp a sun beyond what half floats hold."
+        )
     color = pixels[..., :3] if channels.startswith("RGB") else np.repeat(pixels[..., :1], 3, axis=-1)
     return np.maximum(color, 0)
 
@@ -45,5 +49,6 @@ def environment_emitter(path: Path, name: str) -> mi.Emitter:
         return mi.load_dict({"type": "envmap", "id": "light", "bitmap": mi.Bitmap(radiance)})
     except Exception as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-        raise UserError(f"{name} '{path}' is no environment map ({reason}); give a latitude-longitude image "
-                        f"in OpenEXR.") from error
+        raise UserError(
+            f"{name} '{path}' is no environment map ({reason}); give a latitude-longitude image in OpenEXR."
+        ) from error

@@ -104,8 +104,9 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
             yield
             return
         if _try_lock(handle, wait=wait) is False:
-            raise UserError(f"Another run is writing into '{folder}'; wait for its end, or choose another "
-                            f"place with -o.")
+            raise UserError(
+                f"Another run is writing into '{folder}'; wait for its end, or choose another place with -o."
+            )
         holders.add(key)
         try:
             yield

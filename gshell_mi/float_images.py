@@ -91,8 +91,9 @@ def read_float_image(path: Path) -> tuple[np.ndarray, str]:
         if values.size != (bottom + 1 - y) * (right + 1 - x):
             raise ValueError(f"its channel {name} is stored at another resolution")
         values = values.reshape(bottom + 1 - y, right + 1 - x)
-        pixels[rows, columns, index] = values[rows.start - y:rows.stop - y,
-                                              columns.start - x:columns.stop - x]
+        pixels[rows, columns, index] = values[
+            rows.start - y : rows.stop - y, columns.start - x : columns.stop - x
+        ]
     return pixels, "".join(channels)
 
 
@@ -167,10 +168,10 @@ def _check_rows(path: Path, header: dict) -> None:
         return
     step = _ROWS[compression]
     at = 8
-    while data[at]:    # name and type of an attribute, which end with a 0, and the size of its value
+    while data[at]:  # name and type of an attribute, which end with a 0, and the size of its value
         for _ in range(2):
             at = data.index(0, at) + 1
-        at += 4 + int.from_bytes(data[at:at + 4], "little")
+        at += 4 + int.from_bytes(data[at : at + 4], "little")
     rows = np.arange(window.min.y, window.max.y + 1, step)
     table = np.frombuffer(data, "<u8", len(rows), at + 1)
     if table.max() > len(data) - 8:

@@ -61,8 +61,12 @@ def mask_overlay(target: np.ndarray, fit: np.ndarray, known: np.ndarray) -> np.n
     """
     target, fit = target > 0.5, fit > 0.5
     overlay = np.ones((*target.shape, 3))
-    for chosen, color in ((target & fit, BOTH), (target & ~fit, MASK_ONLY), (fit & ~target, FIT_ONLY),
-                          (~known, UNKNOWN)):
+    for chosen, color in (
+        (target & fit, BOTH),
+        (target & ~fit, MASK_ONLY),
+        (fit & ~target, FIT_ONLY),
+        (~known, UNKNOWN),
+    ):
         overlay[chosen] = color
     return overlay
 

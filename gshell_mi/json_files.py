@@ -20,7 +20,7 @@ def read_json(path: Path) -> Any:
         raise ValueError("it is nested too deeply") from None
     except (json.JSONDecodeError, UnicodeDecodeError):
         raise
-    except ValueError:    # Python's own limit
+    except ValueError:  # Python's own limit
         raise ValueError("it holds an integer of thousands of digits") from None
 
 

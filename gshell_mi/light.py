@@ -22,8 +22,10 @@ def turns_with_camera(sensors: list[mi.Sensor]) -> list[mi.ScalarTransform4f]:
     Returns:
         For each sensor the rotation from the world as the first one sees it.
     """
-    axes = [np.array(mi.traverse(sensor)["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
-            for sensor in sensors]
+    axes = [
+        np.array(mi.traverse(sensor)["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+        for sensor in sensors
+    ]
     axes = [matrix / np.linalg.norm(matrix, axis=0) for matrix in axes]
     turns = np.tile(np.eye(4), (len(axes), 1, 1))
     turns[:, :3, :3] = [matrix @ axes[0].T for matrix in axes]
@@ -63,8 +65,9 @@ class EnvironmentLight:
         if "data" not in parameters:
             return None
         radiance = environment_radiance(emitter)
-        shrunk: Any = resize(radiance, (height, 2 * height, 3), order=1,
-                             anti_aliasing=radiance.shape[0] > height)
+        shrunk: Any = resize(
+            radiance, (height, 2 * height, 3), order=1, anti_aliasing=radiance.shape[0] > height
+        )
         return cls(shrunk, mi.ScalarTransform4f(np.array(parameters["to_world"].matrix).reshape(4, 4)))
 
     @property
@@ -88,9 +91,15 @@ class EnvironmentLight:
 
     def emitter(self) -> mi.Emitter:
         """A new ``envmap`` emitter with the present radiance and the id ``light``."""
-        return mi.load_dict({"type": "envmap", "id": "light",
-                             "to_world": self._to_world,
-                             "bitmap": mi.Bitmap(dr.detach(self.radiance)), "mis_compensation": False})
+        return mi.load_dict(
+            {
+                "type": "envmap",
+                "id": "light",
+                "to_world": self._to_world,
+                "bitmap": mi.Bitmap(dr.detach(self.radiance)),
+                "mis_compensation": False,
+            }
+        )
 
     def update(self, parameters: mi.SceneParameters, key: str = "light.data") -> None:
         """Hands the radiance, attached to the parameter, to the emitter behind ``parameters[key]``."""

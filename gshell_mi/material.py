@@ -41,8 +41,14 @@ class MaterialField:
     interleaved, and one number each that is added to all roughnesses and all metallics.
     """
 
-    def __init__(self, reflectance: np.ndarray, *, base_color: np.ndarray | None = None,
-                 roughness: float = 0.6, metallic: float = 0.05):
+    def __init__(
+        self,
+        reflectance: np.ndarray,
+        *,
+        base_color: np.ndarray | None = None,
+        roughness: float = 0.6,
+        metallic: float = 0.05,
+    ):
         if base_color is not None:
             reflectance = np.broadcast_to(base_color, reflectance.shape)
         count = len(reflectance)
@@ -83,14 +89,22 @@ class GivenMaterial:
             where they are missing.
     """
 
-    def __init__(self, count: int, *, base_color: np.ndarray | None = None, roughness: float = 0.5,
-                 metallic: float = 0.0):
+    def __init__(
+        self,
+        count: int,
+        *,
+        base_color: np.ndarray | None = None,
+        roughness: float = 0.5,
+        metallic: float = 0.0,
+    ):
         color = np.broadcast_to(0.5 if base_color is None else base_color, (count, 3))
         self.parameters: dict[str, mi.Float] = {}
         self.on_lattice: list[str] = []
-        self._values = {"vertex_color": mi.Float(color.astype(np.float32).ravel()),
-                        "vertex_roughness": dr.full(mi.Float, roughness, count),
-                        "vertex_metallic": dr.full(mi.Float, metallic, count)}
+        self._values = {
+            "vertex_color": mi.Float(color.astype(np.float32).ravel()),
+            "vertex_roughness": dr.full(mi.Float, roughness, count),
+            "vertex_metallic": dr.full(mi.Float, metallic, count),
+        }
 
     def carry(self, carried: Carried) -> None:
         """Moves the values to other blocks of the lattice."""
@@ -126,8 +140,10 @@ def given_material(bsdf: mi.BSDF) -> dict:
 
 def principled() -> dict:
     """A two-sided principled BSDF that reads the mesh's attributes, for ``mi.load_dict``."""
-    textures = {parameter: {"type": "mesh_attribute", "name": attribute}
-                for attribute, parameter in ATTRIBUTES.items()}
+    textures = {
+        parameter: {"type": "mesh_attribute", "name": attribute}
+        for attribute, parameter in ATTRIBUTES.items()
+    }
     return {"type": "twosided", "bsdf": {"type": "principled", **textures}}
 
 

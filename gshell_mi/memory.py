@@ -75,8 +75,9 @@ def require(needed: int, free: int | None, what: str, cure: str) -> None:
 are free; lower its resolution.
     """
     if free is not None and needed > free:
-        raise UserError(f"{what} needs about {needed / GIB:.1f} GiB of memory, and {free / GIB:.1f} GiB are "
-                        f"free; {cure}.")
+        raise UserError(
+            f"{what} needs about {needed / GIB:.1f} GiB of memory, and {free / GIB:.1f} GiB are free; {cure}."
+        )
 
 
 def require_for_image(width: int, height: int, spp: int, what: str, cure: str) -> None:

@@ -16,7 +16,7 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:    # trimesh's readers raise whatever they stumble over
+    except Exception as error:  # trimesh's readers raise whatever they stumble over
         raise ValueError(f"cannot be read as a triangle mesh ({_line(error)})") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError("holds no triangles")

@@ -24,17 +24,54 @@ TAG = "written by gshell_mi"
 
 #: The names that runs of each kind may write. A mark may be a stranger's: it is believed in these alone.
 KINDS = {
-    "fit": ("scene.xml", "mesh.ply", "template.ply", "light.exr", "metrics.json", "log.jsonl",
-            "checkpoint.npz", "mesh.glb", "report.html", "mesh.obj", "mesh.mtl", "mesh_base_color.png",
-            "mesh_roughness.png", "mesh_metallic.png", "mesh_normal.png", "remeshed.ply", "views/*.png",
-            "held_out/*.png", "masks/*.png"),
-    "capture": ("sensors.xml", "test.xml", "capture.json", "check.png", "light.*", "view_*.exr",
-                "test/test_*.exr"),
+    "fit": (
+        "scene.xml",
+        "mesh.ply",
+        "template.ply",
+        "light.exr",
+        "metrics.json",
+        "log.jsonl",
+        "checkpoint.npz",
+        "mesh.glb",
+        "report.html",
+        "mesh.obj",
+        "mesh.mtl",
+        "mesh_base_color.png",
+        "mesh_roughness.png",
+        "mesh_metallic.png",
+        "mesh_normal.png",
+        "remeshed.ply",
+        "views/*.png",
+        "held_out/*.png",
+        "masks/*.png",
+    ),
+    "capture": (
+        "sensors.xml",
+        "test.xml",
+        "capture.json",
+        "check.png",
+        "light.*",
+        "view_*.exr",
+        "test/test_*.exr",
+    ),
     "dataset": ("dataset.json", "statistics.json", "sheet.png", "shards/*.npz"),
-    "model": ("model.json", "weights.safetensors", "checkpoint.safetensors", "log.jsonl", "codec.npz",
-              "samples/*.png"),
-    "generate": ("samples.json", "sheet.png", "fields.npz", "interpolation.mp4", "interpolation.gif",
-                 "meshes/*.ply", "meshes/*.glb"),
+    "model": (
+        "model.json",
+        "weights.safetensors",
+        "checkpoint.safetensors",
+        "log.jsonl",
+        "codec.npz",
+        "samples/*.png",
+    ),
+    "generate": (
+        "samples.json",
+        "sheet.png",
+        "fields.npz",
+        "interpolation.mp4",
+        "interpolation.gif",
+        "meshes/*.ply",
+        "meshes/*.glb",
+    ),
     "batch": ("batch.json", "results.jsonl", "results.html"),
 }
 
@@ -63,8 +100,9 @@ class OwnFolder:
 
     def present(self) -> list[str]:
         """Those of ``files`` that are there."""
-        return sorted(name for name in self.files if self._in_the_way(name) is None
-                      and _is_file(self.path / name))
+        return sorted(
+            name for name in self.files if self._in_the_way(name) is None and _is_file(self.path / name)
+        )
 
     def is_marked(self) -> bool:
         return self._read().get("kind") == self.kind
@@ -93,9 +131,11 @@ class OwnFolder:
         """Raises ``UserError`` if a file that is none of ours is in the way of one of ``names``."""
         path = self.foreign(names)
         if path is not None:
-            raise UserError(f"'{path}' is in the way: gshell_mi.{self.kind} has not written it there (or "
-                            f"'{MARK}' does not say so), so it is left alone; move it away or choose "
-                            f"another place with -o.")
+            raise UserError(
+                f"'{path}' is in the way: gshell_mi.{self.kind} has not written it there (or "
+                f"'{MARK}' does not say so), so it is left alone; move it away or choose "
+                f"another place with -o."
+            )
 
     def check_inputs(self, inputs: Iterable[Path], names: Iterable[str] = ()) -> None:
         """Raises ``UserError`` if a file that is read is one that will be written or removed: one of those in
@@ -103,8 +143,9 @@ class OwnFolder:
         own = {key: name for name in self.files.union(names) if (key := _key(self.path / name, link=True))}
         for path in sorted(inputs):
             if _key(path) in own:
-                raise UserError(f"'{path}' is read by this run and would be replaced by it; choose another "
-                                f"place with -o.")
+                raise UserError(
+                    f"'{path}' is read by this run and would be replaced by it; choose another place with -o."
+                )
 
     def claim(self, *names: str) -> None:
         """Lists files that are about to be written.
@@ -125,8 +166,10 @@ class OwnFolder:
             with replacing(self.path / MARK) as partial:
                 partial.write_text(text, encoding="utf-8")
         except OSError as error:
-            raise UserError(f"'{self.path}' cannot be written ({error.strerror or error}); mend its "
-                            f"permissions or choose another place with -o.") from error
+            raise UserError(
+                f"'{self.path}' cannot be written ({error.strerror or error}); mend its "
+                f"permissions or choose another place with -o."
+            ) from error
 
     def take_over(self, staged: Path, last: str, beside: str | None = None) -> None:
         """Moves the files of a folder inside or beside this one into it, and removes those of ours that have
@@ -157,8 +200,10 @@ class OwnFolder:
         """Raises ``UserError`` if one of the files cannot be replaced or removed."""
         for folder in sorted({(self.path / name).parent for name in names}):
             if _is_folder(folder) and not os.access(folder, os.W_OK | os.X_OK):
-                raise UserError(f"'{folder}' cannot be written (Permission denied); mend its permissions or "
-                                f"choose another place with -o.")
+                raise UserError(
+                    f"'{folder}' cannot be written (Permission denied); mend its permissions or "
+                    f"choose another place with -o."
+                )
 
     def clear(self, keep: Iterable[str] = ()) -> None:
         """Removes the files of ours but ``keep``."""
@@ -216,8 +261,10 @@ def own_folder(path: Path, kind: str) -> Iterator[OwnFolder]:
             remove_stale(folder.path)
             yield folder
     except OSError as error:
-        raise UserError(f"'{error.filename or path}' cannot be read or written ({error.strerror or error}); "
-                        f"free some space or mend its permissions.") from error
+        raise UserError(
+            f"'{error.filename or path}' cannot be read or written ({error.strerror or error}); "
+            f"free some space or mend its permissions."
+        ) from error
 
 
 def is_own_file(path: Path) -> bool:
@@ -237,8 +284,10 @@ def check_own_file(path: Path, *, option: str = "-o") -> None:
         option: that names another place.
     """
     if os.path.lexists(path) and not is_own_file(path):
-        raise UserError(f"'{path}' exists and was not written by gshell_mi, so it is left alone; move it "
-                        f"away or choose another place with {option}.")
+        raise UserError(
+            f"'{path}' exists and was not written by gshell_mi, so it is left alone; move it "
+            f"away or choose another place with {option}."
+        )
 
 
 def remove_empty(folder: Path) -> None:
@@ -259,9 +308,14 @@ def remove_tree(folder: Path) -> None:
 
 def _fits(name: str, patterns: Iterable[str]) -> bool:
     parts = name.split("/")
-    return not {"", ".", ".."}.intersection(parts) and "\\" not in name and any(
-        len(parts) == len(split := pattern.split("/")) and all(map(fnmatchcase, parts, split))
-        for pattern in patterns)
+    return (
+        not {"", ".", ".."}.intersection(parts)
+        and "\\" not in name
+        and any(
+            len(parts) == len(split := pattern.split("/")) and all(map(fnmatchcase, parts, split))
+            for pattern in patterns
+        )
+    )
 
 
 def _is_file(path: Path) -> bool:

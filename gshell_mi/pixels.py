@@ -42,8 +42,12 @@ class PixelSample:
 
     def at(self, lane: mi.UInt32) -> PixelSample:
         """The same on some lanes."""
-        return PixelSample(*(dr.gather(type(value), value, lane)
-                             for value in (self.view, self.film, self.radiance, self.alpha)))
+        return PixelSample(
+            *(
+                dr.gather(type(value), value, lane)
+                for value in (self.view, self.film, self.radiance, self.alpha)
+            )
+        )
 
 
 class PixelPool:
@@ -60,12 +64,19 @@ class PixelPool:
         off_outline: leaves out pixels nearer to a mask's outline than this many pixels.
     """
 
-    def __init__(self, views: PinholeViews, targets: list[Target], chosen: np.ndarray | None = None,
-                 off_outline: int = 0):
+    def __init__(
+        self,
+        views: PinholeViews,
+        targets: list[Target],
+        chosen: np.ndarray | None = None,
+        off_outline: int = 0,
+    ):
         chosen = np.arange(len(views)) if chosen is None else chosen
         targets = [targets[index] for index in chosen]
-        places = [_tiled(_near_object(target) & _known(target) & ~_on_outline(target, off_outline))
-                  for target in targets]
+        places = [
+            _tiled(_near_object(target) & _known(target) & ~_on_outline(target, off_outline))
+            for target in targets
+        ]
         rgba = np.concatenate([target.rgba[*place.T] for target, place in zip(targets, places, strict=True)])
         self._pixels = mi.Float(rgba.ravel())
         self._view = mi.UInt32(np.repeat(chosen, [len(place) for place in places]))
@@ -92,8 +103,7 @@ class PixelPool:
         """``weight``, or 0 if a target came without alpha: then coverage is unknown."""
         return weight if self.has_alpha else 0.0
 
-    def sample(self, count: int, *, seed: int, step: int, rays: int = 1,
-               together: int = 1) -> PixelSample:
+    def sample(self, count: int, *, seed: int, step: int, rays: int = 1, together: int = 1) -> PixelSample:
         """What is drawn of ``count`` pixels; the same for the same ``seed`` and ``step``.
 
         Args:
@@ -111,8 +121,9 @@ class PixelPool:
             lane = dr.arange(mi.UInt32, count * together * rays)
             pixel = dr.gather(mi.UInt32, pixel, lane // (rays * together)) + (lane // rays) % together
             pixel, count = dr.minimum(pixel, most), rays * together * count
-            random = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed + 1),
-                              initseq=_sequence(count, step))
+            random = mi.PCG32(
+                size=count, initstate=dr.opaque(mi.UInt64, seed + 1), initseq=_sequence(count, step)
+            )
         view = dr.gather(mi.UInt32, self._view, pixel)
         corner = dr.gather(mi.Point2f, self._corner, pixel)
         film = mi.Point2f(corner + mi.Vector2f(random.next_float32(), random.next_float32()))

@@ -85,7 +85,7 @@ def read_float_map(path: Path) -> np.ndarray:
         if 4 * count > os.path.getsize(path) - file.tell():
             raise ValueError(f"its header promises {width} x {height} pixels, for which it is too short")
         values = np.frombuffer(file.read(4 * count), "<f4" if scale <= 0 else ">f4")
-    rows = values.reshape(height, width, channels)[::-1]    # the lowest row comes first
+    rows = values.reshape(height, width, channels)[::-1]  # the lowest row comes first
     return rows.astype(np.float32) * np.float32(abs(scale))
 
 
@@ -112,7 +112,7 @@ def _radiance_header(file: BinaryIO) -> tuple[int, int]:
     while file.tell() < _LONGEST_HEADER and (line := file.readline(_LONGEST_HEADER)):
         text = line.removesuffix(b"\n").removesuffix(b"\r")
         if not line.endswith(b"\n") or b"\r" in text or b"\0" in text:
-            raise ValueError("its header is damaged")    # Mitsuba may see other lines in it
+            raise ValueError("its header is damaged")  # Mitsuba may see other lines in it
         if text.startswith(b"FORMAT="):
             kind = text.removeprefix(b"FORMAT=").strip()
         if text.lstrip(b" ,\t").startswith(b"-Y") or re.match(rb"[-+][XY] +\d+ +[-+][XY] +\d", text):
@@ -141,7 +141,7 @@ def _unpacked(stored: bytes, width: int, height: int) -> np.ndarray:
     rows, at = np.empty((height, 4 * width), np.uint8), 0
     start = bytes((2, 2, width >> 8, width & 255))
     for row in rows:
-        if stored[at:at + 4] != start:
+        if stored[at : at + 4] != start:
             # Here Mitsuba would begin to read a whole image anew, into memory that ends with this one.
             raise ValueError("a scanline is damaged")
         at = _unpack(stored, at + 4, row, width)
@@ -159,9 +159,9 @@ def _unpack(stored: bytes, at: int, row: np.ndarray, width: int) -> int:
             if count == 0 or filled + count > end or (not repeated and at + 1 + count > len(stored)):
                 raise ValueError("a scanline is damaged or cut off")
             if repeated:
-                row[filled:filled + count] = stored[at + 1]
+                row[filled : filled + count] = stored[at + 1]
             else:
-                row[filled:filled + count] = np.frombuffer(stored, np.uint8, count, at + 1)
+                row[filled : filled + count] = np.frombuffer(stored, np.uint8, count, at + 1)
             at += 2 if repeated else 1 + count
             filled += count
     return at

@@ -13,11 +13,7 @@ import mitsuba as mi
 from .compat import trust_only_own_plugins
 
 #: Modules that define a plugin class at import and register it with Mitsuba.
-PLUGIN_MODULES = (
-    "gshell_mi.shape",
-    "gshell_mi.integrators.gshell_path",
-    "gshell_mi.integrators.gshell_mask",
-)
+PLUGIN_MODULES = ("gshell_mi.shape", "gshell_mi.integrators.gshell_path", "gshell_mi.integrators.gshell_mask")
 
 _registered_variant: str | None = None
 

@@ -36,9 +36,13 @@ class Progress:
         self._quiet, self.warnings = quiet, list[str]()
         self._in_lines = not quiet and not self._console.is_terminal
         self._bars = RichProgress(
-            SpinnerColumn(), TextColumn("{task.description:<18}"), BarColumn(bar_width=24),
-            TextColumn("{task.fields[detail]}"), console=self._console,
-            disable=quiet or self._in_lines)
+            SpinnerColumn(),
+            TextColumn("{task.description:<18}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[detail]}"),
+            console=self._console,
+            disable=quiet or self._in_lines,
+        )
         self._reference = None
 
     def __enter__(self) -> Progress:

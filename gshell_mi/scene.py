@@ -76,20 +76,32 @@ class FitScene:
         notes = coincident_meshes(self.scene.shapes())
         most = max(float(target.rgba[..., 3].max()) for target in self.targets)
         if most < _FULL:
-            notes.append(f"No target has an alpha above {most:.2f}, so the object counts as half "
-                         f"transparent: alpha is coverage; write 1 where the object fills a pixel.")
+            notes.append(
+                f"No target has an alpha above {most:.2f}, so the object counts as half "
+                f"transparent: alpha is coverage; write 1 where the object fills a pixel."
+            )
         return notes
 
     @property
     def target_files(self) -> set[Path]:
         """The files of the targets, and those beside them that say more of them."""
-        return {file for view in (*self.training, *self.held_out) for path in [view.target.path]
-                for file in (path, depth_file(path), known_file(path)) if file is not None}
+        return {
+            file
+            for view in (*self.training, *self.held_out)
+            for path in [view.target.path]
+            for file in (path, depth_file(path), known_file(path))
+            if file is not None
+        }
 
 
-def load_fit_scene(path: Path, targets: Path | None = None, *, hold_out: int = 0,
-                   before_targets: Callable[[mi.Shape, list[mi.Sensor]], None] | None = None,
-                   on_reference: Callable[[int, int], None] | None = None) -> FitScene:
+def load_fit_scene(
+    path: Path,
+    targets: Path | None = None,
+    *,
+    hold_out: int = 0,
+    before_targets: Callable[[mi.Shape, list[mi.Sensor]], None] | None = None,
+    on_reference: Callable[[int, int], None] | None = None,
+) -> FitScene:
     """Loads and checks a fit scene with its targets.
 
     Args:
@@ -116,32 +128,48 @@ def load_fit_scene(path: Path, targets: Path | None = None, *, hold_out: int = 0
         raise UserError(f"Scene '{path}' has no sensors; add a <sensor id=\"view_000\"> per training view.")
     repeated = [name for name, count in Counter(sensor.id() for sensor in sensors).items() if count > 1]
     if repeated:
-        raise UserError(f"Scene '{path}' has several sensors with the id '{repeated[0]}'; "
-                        f"rename all but one.")
+        raise UserError(
+            f"Scene '{path}' has several sensors with the id '{repeated[0]}'; rename all but one."
+        )
     for name in (sensor.id() for sensor in sensors):
         if trouble := name_trouble(name):
-            raise UserError(f"The id {name[:80]!r} of a sensor of scene '{path}' {trouble}; targets and "
-                            f"results are files of these names: give it one such as \"view_000\".")
+            raise UserError(
+                f"The id {name[:80]!r} of a sensor of scene '{path}' {trouble}; targets and "
+                f'results are files of these names: give it one such as "view_000".'
+            )
     held_out = range(0, len(sensors), hold_out) if hold_out else range(0)
     kept = len(sensors) - len(held_out)
     if held_out and kept < _LEAST_VIEWS:
-        raise UserError(f"--hold-out {hold_out} leaves {kept} of the {counted(len(sensors), 'view')} of "
-                        f"'{path}', and a fit needs {_LEAST_VIEWS} at least; give a greater number, add "
-                        f"views, or hold none out.")
+        raise UserError(
+            f"--hold-out {hold_out} leaves {kept} of the {counted(len(sensors), 'view')} of "
+            f"'{path}', and a fit needs {_LEAST_VIEWS} at least; give a greater number, add "
+            f"views, or hold none out."
+        )
     if before_targets:
         before_targets(subject, sensors)
     folder = Path(targets) if targets else path.with_suffix("")
     if targets is None:
         render_missing_targets(folder / "reference.xml", folder, sensors, on_reference)
-    views = [View(sensor, load_target(folder / f"{sensor.id()}.exr", *sensor.film().crop_size()))
-             for sensor in sensors]
+    views = [
+        View(sensor, load_target(folder / f"{sensor.id()}.exr", *sensor.film().crop_size()))
+        for sensor in sensors
+    ]
     training = [view for index, view in enumerate(views) if index not in held_out]
     loaded = [view.target for view in training]
     if not any(target.rgba[..., 3].any() for target in loaded):
-        raise UserError(f"The targets in '{folder}' show no object: their alpha is 0 everywhere; "
-                        f"write coverage into it.")
-    return FitScene(path, scene, subject, subject.bsdf(), light, [view.sensor for view in training], loaded,
-                    [views[index] for index in held_out])
+        raise UserError(
+            f"The targets in '{folder}' show no object: their alpha is 0 everywhere; write coverage into it."
+        )
+    return FitScene(
+        path,
+        scene,
+        subject,
+        subject.bsdf(),
+        light,
+        [view.sensor for view in training],
+        loaded,
+        [views[index] for index in held_out],
+    )
 
 
 def _the_subject(scene: mi.Scene, path: Path) -> mi.Shape:
@@ -149,8 +177,10 @@ def _the_subject(scene: mi.Scene, path: Path) -> mi.Shape:
 
     found = [shape for shape in scene.shapes() if isinstance(shape, GShell)]
     if len(found) != 1:
-        raise UserError(f"Scene '{path}' has {len(found) or 'no'} gshell shapes; a fit needs exactly one "
-                        f"<shape type=\"gshell\" id=\"subject\">.")
+        raise UserError(
+            f"Scene '{path}' has {len(found) or 'no'} gshell shapes; a fit needs exactly one "
+            f'<shape type="gshell" id="subject">.'
+        )
     return found[0]
 
 
@@ -159,18 +189,26 @@ def _the_light(scene: mi.Scene, path: Path) -> mi.Emitter:
     # What the fit starts from and exports: an image, or one colour.
     known = len(found) == 1 and not {"data", "radiance.value"}.isdisjoint(mi.traverse(found[0]).keys())
     if not known or not found[0].is_environment():
-        raise UserError(f"Scene '{path}' has no environment emitter with the id 'light'; add "
-                        f"<emitter type=\"constant\" id=\"light\"/> or an envmap as the initial lighting.")
+        raise UserError(
+            f"Scene '{path}' has no environment emitter with the id 'light'; add "
+            f'<emitter type="constant" id="light"/> or an envmap as the initial lighting.'
+        )
     parameters = mi.traverse(found[0])
     for name in ("data", "scale", "radiance.value"):
         if name in parameters and not np.isfinite(np.array(parameters[name])).all():
-            raise UserError(f"The emitter 'light' of scene '{path}' has a {name} with NaN or infinity; give "
-                            f"it finite values.")
+            raise UserError(
+                f"The emitter 'light' of scene '{path}' has a {name} with NaN or infinity; give "
+                f"it finite values."
+            )
     return found[0]
 
 
-def render_missing_targets(reference: Path, folder: Path, sensors: list[mi.Sensor],
-                           progress: Callable[[int, int], None] | None = None) -> None:
+def render_missing_targets(
+    reference: Path,
+    folder: Path,
+    sensors: list[mi.Sensor],
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
     """Renders the views that have no target in ``folder`` yet, if the scene ``reference`` exists.
 
     Args:
@@ -182,6 +220,7 @@ def render_missing_targets(reference: Path, folder: Path, sensors: list[mi.Senso
     Raises:
         UserError: the reference cannot be loaded, or a target not be written.
     """
+
     def absent() -> list[mi.Sensor]:
         return [sensor for sensor in sensors if not (folder / f"{sensor.id()}.exr").exists()]
 
@@ -192,8 +231,9 @@ def render_missing_targets(reference: Path, folder: Path, sensors: list[mi.Senso
         _render(reference, folder, absent(), progress)
 
 
-def _render(reference: Path, folder: Path, missing: list[mi.Sensor],
-            progress: Callable[[int, int], None] | None) -> None:
+def _render(
+    reference: Path, folder: Path, missing: list[mi.Sensor], progress: Callable[[int, int], None] | None
+) -> None:
     scene = load_scene(reference)
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
     for index, sensor in enumerate(missing):
@@ -207,7 +247,9 @@ def _render(reference: Path, folder: Path, missing: list[mi.Sensor],
             with replacing(target) as partial:
                 write_bitmap(bitmap.convert(component_format=mi.Struct.Type.Float16), partial)
         except OSError as error:
-            raise UserError(f"Target '{target}' cannot be written ({error.strerror or error}); make the "
-                            f"folder writable, or name another with --targets.") from error
+            raise UserError(
+                f"Target '{target}' cannot be written ({error.strerror or error}); make the "
+                f"folder writable, or name another with --targets."
+            ) from error
     if progress:
         progress(len(missing), len(missing))

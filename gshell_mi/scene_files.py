@@ -48,7 +48,7 @@ def load_scene(path: str | Path, *, name: str = "Scene") -> mi.Scene:
         with _resolving_beside(path):
             config = mi.parser.ParserConfig(mi.variant())
             state = mi.parser.parse_file(config, str(path))
-            trust_only_own_plugins()    # <path> has put its folders in front
+            trust_only_own_plugins()  # <path> has put its folders in front
             mi.parser.transform_all(config, state)
             for node in state.nodes:
                 _check_plugin(node.props.plugin_name())
@@ -57,8 +57,9 @@ def load_scene(path: str | Path, *, name: str = "Scene") -> mi.Scene:
     except UserError:
         raise
     except Exception as error:
-        raise UserError(f"{name} '{path}' cannot be loaded by Mitsuba: {_reason(error)}; correct "
-                        f"it.") from error
+        raise UserError(
+            f"{name} '{path}' cannot be loaded by Mitsuba: {_reason(error)}; correct it."
+        ) from error
     scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene
     if not isinstance(scene, mi.Scene):
         raise UserError(f"{name} '{path}' holds no <scene>; give a Mitsuba scene file.")
@@ -84,8 +85,9 @@ class _Enough(Exception):
     """What is looked for has been found."""
 
 
-def _parse(path: Path, started: Callable[[str, dict[str, str]], None],
-           ended: Callable[[str], None] | None = None) -> None:
+def _parse(
+    path: Path, started: Callable[[str, dict[str, str]], None], ended: Callable[[str], None] | None = None
+) -> None:
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = started, ended
     parser.Parse(path.read_bytes(), True)
@@ -145,8 +147,10 @@ def _check_plugin(name: str) -> None:
     registered = () if (mi.variant() or "").startswith("scalar") else (*OWN_PLUGINS, *MITSUBA_INTEGRATORS)
     native = re.fullmatch(r"\w+", name) and any((mitsuba_folder() / "plugins").glob(f"{name}.*"))
     if name not in ("scene", *registered) and not native:
-        raise ValueError(f"it names a plugin '{name}', which neither Mitsuba nor gshell_mi has; scenes may "
-                         f"not bring code of their own")
+        raise ValueError(
+            f"it names a plugin '{name}', which neither Mitsuba nor gshell_mi has; scenes may "
+            f"not bring code of their own"
+        )
 
 
 def _check_images(props: mi.Properties) -> None:
@@ -155,20 +159,23 @@ def _check_images(props: mi.Properties) -> None:
         return
     path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
     if not path.is_file():
-        return    # Mitsuba says so
+        return  # Mitsuba says so
     if props.plugin_name() == "envmap":
         read_environment_map(path, "Environment map")
     if is_exr(path):
         if not _is_plain_exr(path):
-            raise ValueError(f"image '{path}' has a data window other than its display window, which Mitsuba "
-                             f"cannot read; write it without a border or crop")
+            raise ValueError(
+                f"image '{path}' has a data window other than its display window, which Mitsuba "
+                f"cannot read; write it without a border or crop"
+            )
         if props.plugin_name() == "envmap":
-            return    # it has just been read
+            return  # it has just been read
     try:
         (read_float_image if is_exr(path) else check_for_mitsuba)(path)
     except Exception as error:
-        raise ValueError(f"image '{path}' cannot be read ({error}); write it again, as PNG or "
-                         f"OpenEXR") from error
+        raise ValueError(
+            f"image '{path}' cannot be read ({error}); write it again, as PNG or OpenEXR"
+        ) from error
 
 
 def _is_plain_exr(path: Path) -> bool:

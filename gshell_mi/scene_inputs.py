@@ -29,8 +29,9 @@ def _gather(path: Path, roots: list[Path], parameters: dict[str, str], found: se
         document = ElementTree.parse(path).getroot()
     except (OSError, ValueError, RecursionError, ElementTree.ParseError):
         return
-    parameters = parameters | {node.get("name", ""): node.get("value", "")
-                               for node in document.iter("default")}
+    parameters = parameters | {
+        node.get("name", ""): node.get("value", "") for node in document.iter("default")
+    }
 
     def resolved(value: str) -> str:
         return _PARAMETER.sub(lambda match: parameters.get(match[1], match[0]), value)

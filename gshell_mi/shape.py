@@ -300,12 +300,17 @@ class _Padding:
         return dr.select(exists, padded, 0) if fill_with_zero else padded
 
 
-def _initial_fields(filename: str, grid: str, resolution: int | None, to_world: mi.ScalarTransform4f,
-                    band: bool) -> LatticeFields:
+def _initial_fields(
+    filename: str, grid: str, resolution: int | None, to_world: mi.ScalarTransform4f, band: bool
+) -> LatticeFields:
     lattice = make_lattice(grid, 64 if resolution is None else resolution)
     if lattice.resolution > _LARGE and not band:
-        memory.require(_BYTES_PER_VERTEX * lattice.vertex_count, memory.free_memory_of_variant(),
-                       f"A lattice of {lattice.resolution} cells per side", "lower its resolution")
+        memory.require(
+            _BYTES_PER_VERTEX * lattice.vertex_count,
+            memory.free_memory_of_variant(),
+            f"A lattice of {lattice.resolution} cells per side",
+            "lower its resolution",
+        )
     if not filename:
         return sphere(lattice, in_blocks=band)
     path = mi.file_resolver().resolve(filename)

@@ -106,13 +106,17 @@ def with_streams(run: Callable[[], int]) -> int:
             code = _tell(str(error))
         except OSError as error:
             where = "A file" if error.filename is None else f"'{error.filename}'"
-            code = _tell(f"{where} cannot be read or written ({error.strerror or error}); check the path, "
-                         f"its permissions and the free space.")
+            code = _tell(
+                f"{where} cannot be read or written ({error.strerror or error}); check the path, "
+                f"its permissions and the free space."
+            )
         sys.stdout.flush()
         failed = sys.stdout.error
         if code == 0 and failed is not None and not isinstance(failed, BrokenPipeError):
-            code = _tell(f"What was found cannot be printed ({getattr(failed, 'strerror', None) or failed}), "
-                         f"though all files are written; print it to another place.")
+            code = _tell(
+                f"What was found cannot be printed ({getattr(failed, 'strerror', None) or failed}), "
+                f"though all files are written; print it to another place."
+            )
         return code
     finally:
         # What fails now would fail when Python ends, and then not quietly.

@@ -8,8 +8,9 @@ import numpy as np
 import trimesh
 
 
-def subdivided(vertices: np.ndarray, faces: np.ndarray, attributes: dict[str, np.ndarray],
-               levels: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+def subdivided(
+    vertices: np.ndarray, faces: np.ndarray, attributes: dict[str, np.ndarray], levels: int
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Splits every triangle in four, ``levels`` times.
 
     Args:

@@ -71,29 +71,43 @@ def load_target(path: Path, width: int, height: int) -> Target:
     try:
         pixels, channels = read_float_image(path)
     except Exception as error:
-        raise UserError(f"Target '{path}' cannot be read as an image ({_first_line(error)}); write it again "
-                        f"as an OpenEXR file: a target needs R, G, B and A (or R, G and B).") from error
+        raise UserError(
+            f"Target '{path}' cannot be read as an image ({_first_line(error)}); write it again "
+            f"as an OpenEXR file: a target needs R, G, B and A (or R, G and B)."
+        ) from error
     if channels not in ("RGB", "RGBA"):
-        raise UserError(f"Target '{path}' has the channels '{channels}'; "
-                        f"a target needs R, G, B and A (or R, G and B).")
+        raise UserError(
+            f"Target '{path}' has the channels '{channels}'; a target needs R, G, B and A (or R, G and B)."
+        )
     if pixels.shape[:2] != (height, width):
         found_height, found_width = pixels.shape[:2]
-        raise UserError(f"Target '{path}' is {found_width} x {found_height} pixels, but its sensor's film is "
-                        f"{width} x {height}; resize one of them.")
+        raise UserError(
+            f"Target '{path}' is {found_width} x {found_height} pixels, but its sensor's film is "
+            f"{width} x {height}; resize one of them."
+        )
     has_alpha = channels == "RGBA"
     if bad := first_not_finite(pixels):
-        raise UserError(f"Target '{path}' holds NaN or infinity (first at column {bad[0]}, row {bad[1]}); "
-                        f"mend or mask out those pixels.")
+        raise UserError(
+            f"Target '{path}' holds NaN or infinity (first at column {bad[0]}, row {bad[1]}); "
+            f"mend or mask out those pixels."
+        )
     if not has_alpha:
         pixels = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
     alpha = pixels[..., 3]
     if alpha.min() < -_ALPHA_TOLERANCE or alpha.max() > 1 + _ALPHA_TOLERANCE:
-        raise UserError(f"Target '{path}' has alpha between {alpha.min():.3g} and {alpha.max():.3g}; "
-                        f"alpha is coverage and lies between 0 and 1.")
+        raise UserError(
+            f"Target '{path}' has alpha between {alpha.min():.3g} and {alpha.max():.3g}; "
+            f"alpha is coverage and lies between 0 and 1."
+        )
     pixels[..., 3] = np.clip(alpha, 0.0, 1.0)
     depth, known = depth_file(path), known_file(path)
-    return Target(path, pixels, has_alpha, load_depth(depth, width, height) if depth else None,
-                  load_known(known, width, height) if known else None)
+    return Target(
+        path,
+        pixels,
+        has_alpha,
+        load_depth(depth, width, height) if depth else None,
+        load_known(known, width, height) if known else None,
+    )
 
 
 def depth_file(path: Path) -> Path | None:
@@ -122,8 +136,10 @@ def load_known(path: Path, width: int, height: int) -> np.ndarray:
     """
     known = _one_channel(path, "Known map", "1 where the target is known", width, height)
     if not (np.isfinite(known).all() and known.min() >= 0 and known.max() <= 1):
-        raise UserError(f"Known map '{path}' has values that are no shares; write 1 where the target is "
-                        f"known and 0 where it is not.")
+        raise UserError(
+            f"Known map '{path}' has values that are no shares; write 1 where the target is "
+            f"known and 0 where it is not."
+        )
     return known
 
 
@@ -141,8 +157,10 @@ def load_depth(path: Path, width: int, height: int) -> np.ndarray:
     distance = _one_channel(path, "Depth map", "the distance along the ray", width, height)
     distance = np.where(np.isfinite(distance), distance, 0.0)
     if distance.min() < 0:
-        raise UserError(f"Depth map '{path}' has negative distances; write how far the surface is from the "
-                        f"camera, along the ray.")
+        raise UserError(
+            f"Depth map '{path}' has negative distances; write how far the surface is from the "
+            f"camera, along the ray."
+        )
     if not distance.any():
         raise UserError(f"Depth map '{path}' holds no distance at all; delete it, or write some.")
     return distance
@@ -153,13 +171,17 @@ def _one_channel(path: Path, name: str, meaning: str, width: int, height: int) -
     try:
         values = read_float_image(path)[0]
     except Exception as error:
-        raise UserError(f"{name} '{path}' cannot be read as an image ({_first_line(error)}); write it again "
-                        f"as an OpenEXR file.") from error
+        raise UserError(
+            f"{name} '{path}' cannot be read as an image ({_first_line(error)}); write it again "
+            f"as an OpenEXR file."
+        ) from error
     if values.shape[2] > 1 and (values != values[..., :1]).any():
         raise UserError(f"{name} '{path}' has {values.shape[2]} different channels; write one, {meaning}.")
     if values.shape[:2] != (height, width):
-        raise UserError(f"{name} '{path}' is {values.shape[1]} x {values.shape[0]} pixels, but its sensor's "
-                        f"film is {width} x {height}; resize one of them.")
+        raise UserError(
+            f"{name} '{path}' is {values.shape[1]} x {values.shape[0]} pixels, but its sensor's "
+            f"film is {width} x {height}; resize one of them."
+        )
     return values[..., 0]
 
 

@@ -17,8 +17,9 @@ class TemperedAdam(mi.ad.Adam):
     places where it shows most.
     """
 
-    def _step(self, cache: object, value: mi.Float, grad: mi.Float, lr: float,
-              extra: tuple[AnyArray, ...]) -> tuple[mi.Float, tuple[AnyArray, ...]]:
+    def _step(
+        self, cache: object, value: mi.Float, grad: mi.Float, lr: float, extra: tuple[AnyArray, ...]
+    ) -> tuple[mi.Float, tuple[AnyArray, ...]]:
         stepped, extra = super()._step(cache, value, grad, lr, extra)
         second = extra[2]
         share = second / dr.maximum(dr.max(second), 1e-30)

@@ -30,8 +30,9 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
 
 
-def positive_part(vertices: np.ndarray, faces: np.ndarray,
-                  values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def positive_part(
+    vertices: np.ndarray, faces: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The part of a mesh in which (V,) values, linear on every face, are positive: (n, 3) vertices and (m, 3)
     faces. The old vertices come first, in use or not.
 
@@ -54,6 +55,10 @@ def positive_part(vertices: np.ndarray, faces: np.ndarray,
     share = (low / (low - high))[:, None]
     points = (1 - share) * vertices[edges[:, 0]] + share * vertices[edges[:, 1]]
     stays = positive[a]
-    parts = [whole, np.stack([a, ab, ac], axis=1)[stays], np.stack([ab, b, c], axis=1)[~stays],
-             np.stack([ab, c, ac], axis=1)[~stays]]
+    parts = [
+        whole,
+        np.stack([a, ab, ac], axis=1)[stays],
+        np.stack([ab, b, c], axis=1)[~stays],
+        np.stack([ab, c, ac], axis=1)[~stays],
+    ]
     return np.concatenate([vertices, points]), np.concatenate(parts)

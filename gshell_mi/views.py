@@ -12,8 +12,10 @@ import numpy as np
 from .errors import UserError
 
 #: Parameters of the two kinds of sensors: those that traversal shows, by their names in XML.
-OPTICS = {"perspective": ("principal_point_offset_x", "principal_point_offset_y", "near_clip", "far_clip"),
-          "thinlens": ("aperture_radius", "focus_distance", "near_clip", "far_clip")}
+OPTICS = {
+    "perspective": ("principal_point_offset_x", "principal_point_offset_y", "near_clip", "far_clip"),
+    "thinlens": ("aperture_radius", "focus_distance", "near_clip", "far_clip"),
+}
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class PinholeViews:
             if "x_fov" not in parameters:
                 raise UserError(
                     f"Sensor '{sensor.id()}' is a {sensor.class_name()}, but a fit needs perspective "
-                    f"sensors; use <sensor type=\"perspective\"> or \"thinlens\"."
+                    f'sensors; use <sensor type="perspective"> or "thinlens".'
                 )
             to_world = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
             forward = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2])
@@ -108,8 +110,9 @@ class PinholeViews:
         """
         view = dr.opaque(mi.UInt32, view) if isinstance(view, int) else view
         offset = points - self.origins_of(view)
-        scaled = [dr.dot(dr.gather(mi.Vector3f, self._inverse_table, 3 * view + row), offset)
-                  for row in range(3)]
+        scaled = [
+            dr.dot(dr.gather(mi.Vector3f, self._inverse_table, 3 * view + row), offset) for row in range(3)
+        ]
         return mi.Point2f(scaled[0], scaled[1]) / scaled[2], scaled[2]
 
     def origins_of(self, view: mi.UInt32) -> mi.Point3f:

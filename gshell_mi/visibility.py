@@ -13,8 +13,9 @@ from .views import PinholeViews
 _UNTIL = 0.999
 
 
-def best_view(points: np.ndarray, normals: np.ndarray, surface: tuple[np.ndarray, np.ndarray],
-              views: PinholeViews) -> np.ndarray:
+def best_view(
+    points: np.ndarray, normals: np.ndarray, surface: tuple[np.ndarray, np.ndarray], views: PinholeViews
+) -> np.ndarray:
     """(n,) how squarely points of a surface are seen, from whichever side: 1 along the normal, 0 not at all.
 
     That is the greatest cosine between the normal and the direction to a camera which frames the point and

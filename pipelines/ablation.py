@@ -53,21 +53,33 @@ def page(scenes: list[Path], base: FitConfig, output: Path, options: str) -> str
     if NOTES.exists():
         text += NOTES.read_text() + "\n"
     for scene in scenes:
-        rows = [(row.group, f"{row.says} `{as_flags(row.changes)}`" if row.changes else row.says,
-                 load_outcome(Trial(scene, row.name, row.config(base)), output)) for row in ROWS]
+        rows = [
+            (
+                row.group,
+                f"{row.says} `{as_flags(row.changes)}`" if row.changes else row.says,
+                load_outcome(Trial(scene, row.name, row.config(base)), output),
+            )
+            for row in ROWS
+        ]
         if any(outcome for *_, outcome in rows):
             text += f"## {scene.stem}\n\n{table(rows, 'what is left out')}\n"
     return text.rstrip() + "\n"
 
 
 def main(given: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     names = [row.name for row in ROWS]
     add_common_arguments(parser, SCENES, "out/ablation", REPOSITORY / "docs" / "stages.md")
-    parser.add_argument("--rows", nargs="+", choices=names, metavar="NAME",
-                        default=[row.name for row in STAGES],
-                        help="these rows, default: the stages; --list shows what there is")
+    parser.add_argument(
+        "--rows",
+        nargs="+",
+        choices=names,
+        metavar="NAME",
+        default=[row.name for row in STAGES],
+        help="these rows, default: the stages; --list shows what there is",
+    )
     parser.add_argument("--list", action="store_true", help="list the rows and stop")
     arguments = parser.parse_args(given)
     if arguments.list:
@@ -77,8 +89,12 @@ def main(given: list[str] | None = None) -> int:
 
     def trials(base: FitConfig) -> list[Trial]:
         # Row by row, so that a run that is stopped has compared something on every scene.
-        return [Trial(scene, row.name, row.config(base)) for row in ROWS if row.name in arguments.rows
-                for scene in arguments.scenes]
+        return [
+            Trial(scene, row.name, row.config(base))
+            for row in ROWS
+            if row.name in arguments.rows
+            for scene in arguments.scenes
+        ]
 
     return run_study(arguments, trials, page)
 

@@ -41,8 +41,13 @@ def make(folder: Path, count: int, width: int, height: int) -> None:
         right /= np.linalg.norm(right)
         pose = np.eye(4)
         pose[:3] = np.stack([right, np.cross(direction, right), direction, DISTANCE * direction], axis=1)
-        frames.append({"file_path": f"images/{k:03}.jpg", "mask_path": f"masks/{k:03}.png",
-                       "transform_matrix": pose.tolist()})
+        frames.append(
+            {
+                "file_path": f"images/{k:03}.jpg",
+                "mask_path": f"masks/{k:03}.png",
+                "transform_matrix": pose.tolist(),
+            }
+        )
     document = {"w": width, "h": height, "fl_x": FOCAL * width, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document))
 
@@ -62,8 +67,13 @@ def make(folder: Path, count: int, width: int, height: int) -> None:
 def ball(pose: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """(h, w, 3) photograph and (h, w) mask, uint8, computed at an eighth of the size and enlarged."""
     v, u = np.mgrid[4:height:8, 4:width:8]
-    ray = np.stack([(u - width / 2) / (FOCAL * width), -(v - height / 2) / (FOCAL * width),
-                    -np.ones(u.shape)], axis=-1) @ pose[:3, :3].T
+    ray = (
+        np.stack(
+            [(u - width / 2) / (FOCAL * width), -(v - height / 2) / (FOCAL * width), -np.ones(u.shape)],
+            axis=-1,
+        )
+        @ pose[:3, :3].T
+    )
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     along = -ray @ pose[:3, 3]
     room = RADIUS**2 - (DISTANCE**2 - along**2)

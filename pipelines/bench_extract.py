@@ -157,8 +157,9 @@ def run_banded(grid: str, resolutions: list[int], repeats: int) -> None:
         print(f"  {grid} {resolution}^3 in a band of {band.blocks.fraction:.3f} of the cells: {row}")
     for what in BACKWARD:
         exponent = np.log(best[-1][what] / best[0][what]) / np.log(resolutions[-1] / resolutions[0])
-        print(f"  {grid}: seconds of {what} grow with the exponent {exponent:.2f} "
-              f"{verdict(exponent, EXPONENT)}")
+        print(
+            f"  {grid}: seconds of {what} grow with the exponent {exponent:.2f} {verdict(exponent, EXPONENT)}"
+        )
 
 
 def peak_of_band(grid: str, resolution: int) -> float:

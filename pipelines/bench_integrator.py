@@ -47,9 +47,11 @@ def shirt(faces):
 def contestants(depth):
     shared = {"max_depth": depth, "hide_emitters": True}
     ours = {"type": "gshell_path", **shared}
-    return {"prb": {"type": "prb", **shared},
-            **{f"gshell_path, reparam_depth {k}": {**ours, "reparam_depth": k} for k in range(1, depth + 1)},
-            "prb_projective": {"type": "prb_projective", "sppc": 16, "sppp": 16, "sppi": 0, **shared}}
+    return {
+        "prb": {"type": "prb", **shared},
+        **{f"gshell_path, reparam_depth {k}": {**ours, "reparam_depth": k} for k in range(1, depth + 1)},
+        "prb_projective": {"type": "prb_projective", "sppc": 16, "sppp": 16, "sppi": 0, **shared},
+    }
 
 
 def step(mover, integrator, seed, weights):
@@ -70,9 +72,14 @@ def step(mover, integrator, seed, weights):
 def run(faces, resolution, depth, repeats):
     def build(pixels):
         v, f = shirt(faces)
-        return (gradient_scenes.load(gradient_scenes.camera(pixels, (1.5, 1.5, 4)), gradient_scenes.sky(),
-                                     gradient_scenes.make_mesh("subject", v, f)),
-                gradient_scenes.translation(v, (1, 0, 0)))
+        return (
+            gradient_scenes.load(
+                gradient_scenes.camera(pixels, (1.5, 1.5, 4)),
+                gradient_scenes.sky(),
+                gradient_scenes.make_mesh("subject", v, f),
+            ),
+            gradient_scenes.translation(v, (1, 0, 0)),
+        )
 
     mover = gradient_scenes.Mover(gradient_scenes.GradientScene("shirt", "", build), resolution)
     count = dr.width(mover.params["subject.faces"]) // 3
@@ -82,30 +89,42 @@ def run(faces, resolution, depth, repeats):
     for seed in range(repeats + 2):
         for name, integrator in integrators.items():
             result = step(mover, integrator, seed, weights)
-            if seed >= 2:    # the first two compile and warm up
+            if seed >= 2:  # the first two compile and warm up
                 results[name].append(result)
     least = {name: min(work for work, _, _ in r) for name, r in results.items()}
     clock = {name: min(t for _, t, _ in r) for name, r in results.items()}
     values = {name: np.array([d for _, _, d in r]) for name, r in results.items()}
     ratio = {name: least[name] / least["prb"] for name in least}
     noise = {name: values[name].std(ddof=1) * np.sqrt(least[name]) for name in least}
-    print(f"\n{count} faces, depth {depth}\n\n"
-          "| integrator | processor s | s | ratio to prb | mean | std | std sqrt(processor s) |\n"
-          "|---|---|---|---|---|---|---|")
+    print(
+        f"\n{count} faces, depth {depth}\n\n"
+        "| integrator | processor s | s | ratio to prb | mean | std | std sqrt(processor s) |\n"
+        "|---|---|---|---|---|---|---|"
+    )
     for name, x in values.items():
-        print(f"| {name} | {least[name]:.3f} | {clock[name]:.3f} | {ratio[name]:.2f} | {x.mean():.0f} "
-              f"| {x.std(ddof=1):.0f} | {noise[name]:.0f} |", flush=True)
+        print(
+            f"| {name} | {least[name]:.3f} | {clock[name]:.3f} | {ratio[name]:.2f} | {x.mean():.0f} "
+            f"| {x.std(ddof=1):.0f} | {noise[name]:.0f} |",
+            flush=True,
+        )
     bar = 1.3 if count < 20_000 else 1.5
     for name, limit in (("gshell_path, reparam_depth 1", bar), ("gshell_path, reparam_depth 2", 3.0)):
         if name in ratio:
-            print(f"\n{name}: time {ratio[name]:.2f} of prb ({'within' if ratio[name] <= limit else 'ABOVE'} "
-                  f"{limit}); noise prb_projective / ours {noise['prb_projective'] / noise[name]:.1f}")
+            print(
+                f"\n{name}: time {ratio[name]:.2f} of prb ({'within' if ratio[name] <= limit else 'ABOVE'} "
+                f"{limit}); noise prb_projective / ours {noise['prb_projective'] / noise[name]:.1f}"
+            )
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--faces", type=int, nargs="*", default=[4000, 80000],
-                        help="approximate numbers of faces (default 4000 80000)")
+    parser.add_argument(
+        "--faces",
+        type=int,
+        nargs="*",
+        default=[4000, 80000],
+        help="approximate numbers of faces (default 4000 80000)",
+    )
     parser.add_argument("--resolution", type=int, default=256, help="pixels per side (default 256)")
     parser.add_argument("--depth", type=int, default=3, help="max_depth (default 3)")
     parser.add_argument("--repeats", type=int, default=12, help="seeds per contestant (default 12)")

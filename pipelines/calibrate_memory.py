@@ -23,8 +23,18 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "pipelines"))
 from scene_builder import files
 
 CASES = ("32:24:128", "64:24:128", "64:48:256", "128:24:256", "64:12:800")
-SHORT = ("--openings.iterations", "15", "--cavities.iterations", "10",
-         "--refinement.iterations", "6", "--folds.iterations", "0", "--iterations", "12")
+SHORT = (
+    "--openings.iterations",
+    "15",
+    "--cavities.iterations",
+    "10",
+    "--refinement.iterations",
+    "6",
+    "--folds.iterations",
+    "0",
+    "--iterations",
+    "12",
+)
 
 
 def write_case(reference: mi.Scene, work: Path, resolution: int, views: int, pixels: int) -> Path:
@@ -36,11 +46,17 @@ def write_case(reference: mi.Scene, work: Path, resolution: int, views: int, pix
     radius = np.linalg.norm(np.maximum(np.abs(box.min), np.abs(box.max)))
     distance = 1.04 * radius / np.sin(np.radians(files.FOV / 2))
     scene = work / f"{name}.xml"
-    scene.write_text(files.scene_xml(
-        f'<shape type="gshell" id="subject"><integer name="resolution" value="{resolution}"/></shape>\n'
-        '<emitter type="constant" id="light"/>\n',
-        *(files.sensor_xml(f"view_{index:03}", distance * direction)
-          for index, direction in enumerate(files.fibonacci_sphere(views))), spp=4))
+    scene.write_text(
+        files.scene_xml(
+            f'<shape type="gshell" id="subject"><integer name="resolution" value="{resolution}"/></shape>\n'
+            '<emitter type="constant" id="light"/>\n',
+            *(
+                files.sensor_xml(f"view_{index:03}", distance * direction)
+                for index, direction in enumerate(files.fibonacci_sphere(views))
+            ),
+            spp=4,
+        )
+    )
     integrator = mi.load_dict({"type": "path", "max_depth": 3, "hide_emitters": True})
     for sensor in mi.load_file(str(scene)).sensors():
         image = mi.render(reference, sensor=sensor, integrator=integrator, spp=4)
@@ -51,8 +67,21 @@ def write_case(reference: mi.Scene, work: Path, resolution: int, views: int, pix
 def measure(scene: Path) -> dict:
     """The metrics of a short fit in a process of its own."""
     output = scene.with_name(f"{scene.stem}_fit")
-    subprocess.run([sys.executable, "-m", "gshell_mi.fit", str(scene), "-o", str(output), "--overwrite",
-                    "--quiet", *SHORT], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "gshell_mi.fit",
+            str(scene),
+            "-o",
+            str(output),
+            "--overwrite",
+            "--quiet",
+            *SHORT,
+        ],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
     return json.loads((output / "metrics.json").read_text())
 
 
@@ -71,8 +100,10 @@ def main() -> None:
         resolution, views, pixels = map(int, case.split(":"))
         metrics = measure(write_case(reference, given.work, resolution, views, pixels))
         estimate, peak = metrics["estimated_memory_mib"], metrics["peak_memory_mib"]
-        print(f"| {resolution} | {views} | {pixels}² | {estimate} | {peak} | {estimate / peak:.2f} |",
-              flush=True)
+        print(
+            f"| {resolution} | {views} | {pixels}² | {estimate} | {peak} | {estimate / peak:.2f} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Writes docs/commands.md from the dataclasses that are the commands' arguments.
 
-    python pipelines/command_reference.py           # writes it
-    python pipelines/command_reference.py --check   # exit code 1 if it is out of date
+python pipelines/command_reference.py           # writes it
+python pipelines/command_reference.py --check   # exit code 1 if it is out of date
 """
 
 from __future__ import annotations
@@ -17,8 +17,19 @@ import textwrap
 import typing
 from pathlib import Path
 
-COMMANDS = ("capture", "fit", "export", "turntable", "compare", "report", "dataset", "train", "generate",
-            "generate.evaluate", "batch")
+COMMANDS = (
+    "capture",
+    "fit",
+    "export",
+    "turntable",
+    "compare",
+    "report",
+    "dataset",
+    "train",
+    "generate",
+    "generate.evaluate",
+    "batch",
+)
 PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 
 _INTRODUCTION = """\
@@ -38,8 +49,11 @@ def reference() -> str:
         inner = command if "." in command else f"{command}.__main__"
         module = importlib.import_module(f"gshell_mi.{inner}")
         title = module.__doc__.splitlines()[0].split(": ", 1)[1]
-        sections.append(f"## `python -m gshell_mi.{command}`\n\n{title[0].upper()}{title[1:]}\n\n"
-                        + "\n\n".join(_tables(module._Arguments)) + "\n")
+        sections.append(
+            f"## `python -m gshell_mi.{command}`\n\n{title[0].upper()}{title[1:]}\n\n"
+            + "\n\n".join(_tables(module._Arguments))
+            + "\n"
+        )
     return "\n".join(sections)
 
 
@@ -87,8 +101,11 @@ def field_texts(arguments: type) -> dict[str, str]:
     for kind in reversed([kind for kind in arguments.__mro__ if dataclasses.is_dataclass(kind)]):
         body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body
         for statement, following in itertools.pairwise(body):
-            if (isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr)
-                    and isinstance(following.value, ast.Constant)):
+            if (
+                isinstance(statement, ast.AnnAssign)
+                and isinstance(following, ast.Expr)
+                and isinstance(following.value, ast.Constant)
+            ):
                 texts[statement.target.id] = " ".join(following.value.value.split()).replace("|", "\\|")
     return texts
 

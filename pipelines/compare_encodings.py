@@ -1,6 +1,6 @@
 """What each encoding of generated garments loses: the table of docs/generation.md.
 
-    python pipelines/compare_encodings.py [--garments 100] [--side 64] [--seed 1] [--model FOLDER]
+python pipelines/compare_encodings.py [--garments 100] [--side 64] [--seed 1] [--model FOLDER]
 """
 
 from __future__ import annotations
@@ -71,8 +71,11 @@ def _row(name: str, numbers: float, meshes: list, decoded) -> None:
         chamfer.append(round_trip(again, mesh))
         true, found = (topology(np.asarray(m.vertices), np.asarray(m.faces)) for m in (mesh, again))
         right.append((true.boundary_loops, true.components) == (found.boundary_loops, found.components))
-    print(f"| {name} | {numbers:.0f} | {np.mean(chamfer):.4f} | {np.max(chamfer):.4f} | "
-          f"{100 * np.mean(right):.1f} | {seconds / len(meshes):.3f} |", flush=True)
+    print(
+        f"| {name} | {numbers:.0f} | {np.mean(chamfer):.4f} | {np.max(chamfer):.4f} | "
+        f"{100 * np.mean(right):.1f} | {seconds / len(meshes):.3f} |",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":

@@ -51,9 +51,12 @@ def measure(grid: str, resolution: int, repeats: int) -> dict[str, float]:
         smallest.append(np.percentile(np.degrees(mesh.face_angles.min(axis=1)), 5))
     by_direction = np.mean(angles, axis=1)
     return {
-        "vertices": np.mean(vertices), "distance": 1e3 * np.mean(distances) / _RADIUS,
-        "angle": by_direction.mean(), "ratio": by_direction.max() / by_direction.min(),
-        "smallest": np.mean(smallest), "ms": 1e3 * seconds,
+        "vertices": np.mean(vertices),
+        "distance": 1e3 * np.mean(distances) / _RADIUS,
+        "angle": by_direction.mean(),
+        "ratio": by_direction.max() / by_direction.min(),
+        "smallest": np.mean(smallest),
+        "ms": 1e3 * seconds,
     }
 
 
@@ -65,16 +68,26 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="spheres that are averaged over")
     arguments = parser.parse_args()
     dr.set_thread_count(1)
-    print("| grid | cells per side | vertices | distance (1e-3) | normals (degrees) | worst / best direction "
-          "| smallest angle (degrees) | ms |")
+    print(
+        "| grid | cells per side | vertices | distance (1e-3) | normals (degrees) | worst / best direction "
+        "| smallest angle (degrees) | ms |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for grid in GRIDS:
         trial = measure(grid, 32, arguments.repeats)["vertices"]
         resolution = round(32 * (arguments.vertices / trial) ** 0.5)
         found = measure(grid, resolution, arguments.repeats)
-        figures = (f"{found[name]:{digits}}" for name, digits in (
-            ("vertices", ".0f"), ("distance", ".3f"), ("angle", ".2f"), ("ratio", ".2f"),
-            ("smallest", ".1f"), ("ms", ".1f")))
+        figures = (
+            f"{found[name]:{digits}}"
+            for name, digits in (
+                ("vertices", ".0f"),
+                ("distance", ".3f"),
+                ("angle", ".2f"),
+                ("ratio", ".2f"),
+                ("smallest", ".1f"),
+                ("ms", ".1f"),
+            )
+        )
         print(f"| `{grid}` | {resolution} | {' | '.join(figures)} |")
 
 

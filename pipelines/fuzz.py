@@ -27,8 +27,14 @@ sys.path[:0] = [str(ROOT), str(ROOT / "pipelines")]
 LIMIT, START = 10.0, 300.0
 
 #: What failures are, by a word in their line; what has none of these is an exception that nobody caught.
-KINDS = {"ends the process": "crashes", "takes ": "hangs", "outside of the output": "files outside",
-         "left behind": "half-written files", "half-written": "half-written files", "": "tracebacks"}
+KINDS = {
+    "ends the process": "crashes",
+    "takes ": "hangs",
+    "outside of the output": "files outside",
+    "left behind": "half-written files",
+    "half-written": "half-written files",
+    "": "tracebacks",
+}
 
 
 @dataclass
@@ -62,8 +68,9 @@ class Findings:
         return sum(self.outcomes.values()) + len(self.failures)
 
 
-def fuzz(targets: list[str], seconds: float, *, seed: int = 0, most: int = 10**9,
-         limit: float = LIMIT) -> Findings:
+def fuzz(
+    targets: list[str], seconds: float, *, seed: int = 0, most: int = 10**9, limit: float = LIMIT
+) -> Findings:
     """Tries damaged inputs of each target in turn, in a process of its own that may crash or hang.
 
     Args:
@@ -80,15 +87,20 @@ def fuzz(targets: list[str], seconds: float, *, seed: int = 0, most: int = 10**9
     return findings
 
 
-def _worker(target: str, seed: int, first: int, seconds: float, most: int, limit: float,
-            findings: Findings) -> tuple[int, float]:
+def _worker(
+    target: str, seed: int, first: int, seconds: float, most: int, limit: float, findings: Findings
+) -> tuple[int, float]:
     """Runs one process until the time is over or it dies; the next input's number, and the seconds spent."""
     reading, writing = os.pipe()
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "pipelines")])}
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as said:
         process = subprocess.Popen(
             [sys.executable, __file__, "--worker", *map(str, (writing, target, seed, first, most, folder))],
-            pass_fds=[writing], stdout=said, stderr=said, env=environment)
+            pass_fds=[writing],
+            stdout=said,
+            stderr=said,
+            env=environment,
+        )
         os.close(writing)
         try:
             return _watch(process, reading, target, first, seconds, findings, said, limit)
@@ -98,8 +110,16 @@ def _worker(target: str, seed: int, first: int, seconds: float, most: int, limit
             os.close(reading)
 
 
-def _watch(process: subprocess.Popen, reading: int, target: str, number: int, seconds: float,
-           findings: Findings, said, most: float = LIMIT) -> tuple[int, float]:
+def _watch(
+    process: subprocess.Popen,
+    reading: int,
+    target: str,
+    number: int,
+    seconds: float,
+    findings: Findings,
+    said,
+    most: float = LIMIT,
+) -> tuple[int, float]:
     selector = selectors.DefaultSelector()
     selector.register(reading, selectors.EVENT_READ)
     buffer, started, limit = b"", None, START * most / LIMIT
@@ -118,18 +138,19 @@ def _watch(process: subprocess.Popen, reading: int, target: str, number: int, se
             if chunk:
                 return number, seconds
             if process.wait() == 0:
-                return number, seconds    # it has tried as many as it should
+                return number, seconds  # it has tried as many as it should
             said.seek(0)
             tail = said.read()[-300:].decode(errors="replace").strip().splitlines()
             what = f"ends the process with {process.returncode} ({tail[-1] if tail else 'nothing said'})"
         findings.failures.append(f"{target}:{number} {what}")
-        if started is None:    # it cannot even read good inputs
+        if started is None:  # it cannot even read good inputs
             return number, seconds
         return number + 1, time.monotonic() - started
 
 
-def _note(line: str, target: str, number: int, started: float | None,
-          findings: Findings) -> tuple[int, float | None]:
+def _note(
+    line: str, target: str, number: int, started: float | None, findings: Findings
+) -> tuple[int, float | None]:
     word, _, rest = line.partition(" ")
     if word == "ready":
         return number, time.monotonic()
@@ -190,9 +211,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--targets", nargs="*", help="default: all")
     parser.add_argument("--most", type=int, default=10**9, help="inputs of each target")
-    parser.add_argument("--limit", type=float, default=LIMIT,
-                        help="seconds that an input may take on the clock; more on a machine that is busy "
-                        f"(default {LIMIT:g}); of the processors it may always take {LIMIT:g}")
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=LIMIT,
+        help="seconds that an input may take on the clock; more on a machine that is busy "
+        f"(default {LIMIT:g}); of the processors it may always take {LIMIT:g}",
+    )
     parser.add_argument("--only", help="TARGET:NUMBER, to see one input fail")
     parser.add_argument("--worker", nargs=6, help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
@@ -209,8 +234,9 @@ def main(arguments: list[str] | None = None) -> int:
 
     findings, targets = Findings(), given.targets or list(TARGETS)
     for target in targets:
-        found = fuzz([target], 60 * given.minutes / len(targets), seed=given.seed, most=given.most,
-                     limit=given.limit)
+        found = fuzz(
+            [target], 60 * given.minutes / len(targets), seed=given.seed, most=given.most, limit=given.limit
+        )
         for outcome, count in sorted(found.outcomes.items()):
             print(f"{outcome:24} {count:7}", flush=True)
         for kind in found.kinds():

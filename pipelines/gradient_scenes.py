@@ -21,19 +21,25 @@ ROOT = Path(__file__).parents[1]
 class GradientScene:
     """A scene, whose emitters are to be hidden, and the motion of its mesh ``subject``."""
 
-    name: str                   #: short name, also of the image file
-    about: str                  #: what it shows
-    build: Callable             #: resolution in pixels -> (scene, motion of the vertices, V x 3)
-    depth: int = 2              #: path length (``max_depth``)
-    step: float = 0.01          #: of the finite differences, in units of the parameter
+    name: str  #: short name, also of the image file
+    about: str  #: what it shows
+    build: Callable  #: resolution in pixels -> (scene, motion of the vertices, V x 3)
+    depth: int = 2  #: path length (``max_depth``)
+    step: float = 0.01  #: of the finite differences, in units of the parameter
 
 
 def make_mesh(name, vertices, faces, bsdf=None, *, uv=None, smooth=True):
     """A ``mi.Mesh`` of given arrays, with smooth vertex normals or flat faces."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf or diffuse())
-    mesh = mi.Mesh(name, len(vertices), len(faces), properties, has_vertex_normals=smooth,
-                   has_vertex_texcoords=uv is not None)
+    mesh = mi.Mesh(
+        name,
+        len(vertices),
+        len(faces),
+        properties,
+        has_vertex_normals=smooth,
+        has_vertex_texcoords=uv is not None,
+    )
     params = mi.traverse(mesh)
     params["vertex_positions"] = mi.Float(np.asarray(vertices, np.float32).ravel())
     params["faces"] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
@@ -44,16 +50,28 @@ def make_mesh(name, vertices, faces, bsdf=None, *, uv=None, smooth=True):
 
 
 def camera(resolution, origin=(0, 0, 5), target=(0, 0, 0), up=(0, 1, 0), **film):
-    return {"type": "perspective", "fov": 40, "near_clip": 0.05,
-            "to_world": mi.ScalarTransform4f().look_at(list(origin), list(target), list(up)),
-            "sampler": {"type": "independent"},
-            "film": {"type": "hdrfilm", "width": resolution, "height": resolution, "pixel_format": "rgba",
-                     "rfilter": {"type": "gaussian"}, **film}}
+    return {
+        "type": "perspective",
+        "fov": 40,
+        "near_clip": 0.05,
+        "to_world": mi.ScalarTransform4f().look_at(list(origin), list(target), list(up)),
+        "sampler": {"type": "independent"},
+        "film": {
+            "type": "hdrfilm",
+            "width": resolution,
+            "height": resolution,
+            "pixel_format": "rgba",
+            "rfilter": {"type": "gaussian"},
+            **film,
+        },
+    }
 
 
 def diffuse(*colour):
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {
-        "type": "rgb", "value": list(colour) or [0.8, 0.5, 0.3]}}}
+    return {
+        "type": "twosided",
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(colour) or [0.8, 0.5, 0.3]}},
+    }
 
 
 def sky():
@@ -101,8 +119,9 @@ def uv_sphere(radius=1.0, centre=(0, 0, 0), n=24):
     vertices[:, -1] = vertices[:, 0]
     vertices[0], vertices[-1] = (0, 1, 0), (0, -1, 0)
     i = (np.arange(n)[:, None] * (2 * n + 1) + np.arange(2 * n)).ravel()
-    faces = np.concatenate([np.stack([i, i + 1, i + 2 * n + 2], -1),
-                            np.stack([i, i + 2 * n + 2, i + 2 * n + 1], -1)])
+    faces = np.concatenate(
+        [np.stack([i, i + 1, i + 2 * n + 2], -1), np.stack([i, i + 2 * n + 2, i + 2 * n + 1], -1)]
+    )
     uv = np.stack([u, v], -1).reshape(-1, 2)
     return vertices.reshape(-1, 3) * radius + np.array(centre), faces, uv
 
@@ -110,8 +129,10 @@ def uv_sphere(radius=1.0, centre=(0, 0, 0), n=24):
 def open_cylinder(n=32, rings=8, radius=0.8, height=1.6):
     phi = np.arange(n) / n * 2 * np.pi
     y = np.linspace(-0.5, 0.5, rings + 1) * height
-    vertices = np.stack([np.tile(radius * np.cos(phi), rings + 1), np.repeat(y, n),
-                         np.tile(radius * np.sin(phi), rings + 1)], -1)
+    vertices = np.stack(
+        [np.tile(radius * np.cos(phi), rings + 1), np.repeat(y, n), np.tile(radius * np.sin(phi), rings + 1)],
+        -1,
+    )
     j, i = np.meshgrid(np.arange(rings), np.arange(n), indexing="ij")
     a, b = (j * n + i).ravel(), (j * n + (i + 1) % n).ravel()
     return vertices, np.concatenate([np.stack([a, b, b + n], -1), np.stack([a, b + n, a + n], -1)])
@@ -156,16 +177,22 @@ def translation(vertices, direction=(1, 0.5, 0.3)):
 def _sphere(motion):
     def build(resolution):
         v, f = sphere()
-        return (load(camera(resolution), constant(), make_mesh("subject", v, f)),
-                translation(v) if motion == "translate" else v)
+        return (
+            load(camera(resolution), constant(), make_mesh("subject", v, f)),
+            translation(v) if motion == "translate" else v,
+        )
+
     return build
 
 
 def _sheet(motion):
     def build(resolution):
         v, f = sheet()
-        return (load(camera(resolution, (1, 1, 4)), sky(), make_mesh("subject", v, f)),
-                translation(v) if motion == "translate" else v)
+        return (
+            load(camera(resolution, (1, 1, 4)), sky(), make_mesh("subject", v, f)),
+            translation(v) if motion == "translate" else v,
+        )
+
     return build
 
 
@@ -173,8 +200,11 @@ def _shirt(motion, light=sky):
     def build(resolution):
         v, f = shirt()
         normals = np.array(trimesh.Trimesh(v, f, process=False).vertex_normals)
-        return (load(camera(resolution, (1.5, 1.5, 4)), light(), make_mesh("subject", v, f)),
-                translation(v) if motion == "translate" else 0.5 * normals)
+        return (
+            load(camera(resolution, (1.5, 1.5, 4)), light(), make_mesh("subject", v, f)),
+            translation(v) if motion == "translate" else 0.5 * normals,
+        )
+
     return build
 
 
@@ -186,24 +216,39 @@ def _pleats(resolution):
 def _cube(resolution):
     box = trimesh.creation.box((1.2, 1.2, 1.2))
     v, f = np.array(box.vertices), np.array(box.faces)
-    return (load(camera(resolution, (2, 2.5, 4)), constant(), make_mesh("subject", v, f, smooth=False)),
-            translation(v))
+    return (
+        load(camera(resolution, (2, 2.5, 4)), constant(), make_mesh("subject", v, f, smooth=False)),
+        translation(v),
+    )
 
 
 def _flat_cube_sky(resolution):
     box = trimesh.creation.box((1.2, 1.2, 1.2))
     v, f = np.array(box.vertices), np.array(box.faces)
-    return (load(camera(resolution, (2, 2.5, 4)), sky(), make_mesh("subject", v, f, smooth=False)),
-            translation(v))
+    return (
+        load(camera(resolution, (2, 2.5, 4)), sky(), make_mesh("subject", v, f, smooth=False)),
+        translation(v),
+    )
 
 
 def _seam_over_mirror(resolution):
     v, f, uv = uv_sphere(0.6, (0, 0.9, 0))
-    mirror = make_mesh("mirror", *plane(), {"type": "twosided", "bsdf": {
-        "type": "roughconductor", "alpha": 0.3, "material": "Al"}}, smooth=False)
+    mirror = make_mesh(
+        "mirror",
+        *plane(),
+        {"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.3, "material": "Al"}},
+        smooth=False,
+    )
     texture = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": chequers()}}
-    return (load(camera(resolution, (0, 3, 4.5), (0, 0.5, 0)), constant(),
-                 make_mesh("subject", v, f, texture, uv=uv), mirror=mirror), translation(v, (0.3, 1, -0.3)))
+    return (
+        load(
+            camera(resolution, (0, 3, 4.5), (0, 0.5, 0)),
+            constant(),
+            make_mesh("subject", v, f, texture, uv=uv),
+            mirror=mirror,
+        ),
+        translation(v, (0.3, 1, -0.3)),
+    )
 
 
 def _seam_self_shadowed(resolution):
@@ -217,44 +262,67 @@ def _textured_light(smooth):
     def build(resolution):
         v, f = sphere(3, 0.8)
         to_world = mi.ScalarTransform4f().look_at([1.5, 2.5, 2.5], [0, 0, 0], [0, 1, 0])
-        light = {"type": "rectangle", "to_world": to_world,
-                 "emitter": {"type": "area", "radiance": {**chequers(4)}}}
+        light = {
+            "type": "rectangle",
+            "to_world": to_world,
+            "emitter": {"type": "area", "radiance": {**chequers(4)}},
+        }
         return load(camera(resolution), light, make_mesh("subject", v, f, smooth=smooth)), translation(v)
+
     return build
 
 
 def _coarse(resolution):
     v, f = sphere(1, 0.8)
-    return (load(camera(resolution), _point_light([1.5, 2.5, 2.5]), make_mesh("subject", v, f)),
-            translation(v))
+    return (
+        load(camera(resolution), _point_light([1.5, 2.5, 2.5]), make_mesh("subject", v, f)),
+        translation(v),
+    )
 
 
 def _frame(sample_border, **film):
     def build(resolution):
         v, f = sphere(3, 0.8, (1.7, 0.4, 0))
-        return (load(camera(resolution, sample_border=sample_border, **film), constant(),
-                     make_mesh("subject", v, f)), translation(v))
+        return (
+            load(
+                camera(resolution, sample_border=sample_border, **film),
+                constant(),
+                make_mesh("subject", v, f),
+            ),
+            translation(v),
+        )
+
     return build
 
 
 def _box_filter(resolution):
     v, f = sphere()
-    return (load(camera(resolution, rfilter={"type": "box"}), constant(), make_mesh("subject", v, f)),
-            translation(v))
+    return (
+        load(camera(resolution, rfilter={"type": "box"}), constant(), make_mesh("subject", v, f)),
+        translation(v),
+    )
 
 
 def _occluder(resolution):
     v, f = sphere(3, 0.9)
     w, g = sheet(4, 0.9)
-    return (load(camera(resolution, (0.3, 0.4, 5)), constant(), make_mesh("subject", v, f),
-                 occluder=make_mesh("occluder", w + np.array([0.4, 0.2, 1.6]), g, diffuse(0.1, 0.2, 0.7))),
-            translation(v))
+    return (
+        load(
+            camera(resolution, (0.3, 0.4, 5)),
+            constant(),
+            make_mesh("subject", v, f),
+            occluder=make_mesh("occluder", w + np.array([0.4, 0.2, 1.6]), g, diffuse(0.1, 0.2, 0.7)),
+        ),
+        translation(v),
+    )
 
 
 def _open_box(resolution):
     v, f = box_without_top()
-    return (load(camera(resolution, (1.5, 3.5, 3)), sky(), make_mesh("subject", v, f, smooth=False)),
-            translation(v))
+    return (
+        load(camera(resolution, (1.5, 3.5, 3)), sky(), make_mesh("subject", v, f, smooth=False)),
+        translation(v),
+    )
 
 
 def _thin_sheet(resolution):
@@ -268,8 +336,16 @@ def _shadow_on_plane(light):
         v, f = sphere(3, 0.5, (0.3, 0.8, 0))
         # Darker than the plane: else the object and its shadow nearly cancel
         dark = diffuse(0.1, 0.15, 0.2)
-        return (load(camera(resolution, (0.2, 6, 4)), light(), make_mesh("subject", v, f, dark),
-                     plane=make_mesh("plane", *plane(), smooth=False)), translation(v))
+        return (
+            load(
+                camera(resolution, (0.2, 6, 4)),
+                light(),
+                make_mesh("subject", v, f, dark),
+                plane=make_mesh("plane", *plane(), smooth=False),
+            ),
+            translation(v),
+        )
+
     return build
 
 
@@ -278,13 +354,19 @@ def _point_light(position=(2, 4, 1)):
 
 
 def directional_light(direction=(-0.4, -1, -0.2), irradiance=1.0):
-    return {"type": "directional", "direction": list(direction),
-            "irradiance": {"type": "rgb", "value": [irradiance] * 3}}
+    return {
+        "type": "directional",
+        "direction": list(direction),
+        "irradiance": {"type": "rgb", "value": [irradiance] * 3},
+    }
 
 
 def _area_light():
-    return {"type": "rectangle", "to_world": mi.ScalarTransform4f().look_at([2, 4, 1], [0, 0, 0], [0, 0, 1])
-            .scale(0.7), "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [6.0] * 3}}}
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().look_at([2, 4, 1], [0, 0, 0], [0, 0, 1]).scale(0.7),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [6.0] * 3}},
+    }
 
 
 SCENES = (
@@ -294,13 +376,17 @@ SCENES = (
     GradientScene("sheet_scaling", "open boundary", _sheet("scale")),
     GradientScene("shirt_translating", "open garment, self-shadowed", _shirt("translate")),
     GradientScene("shirt_inflating", "open garment, deforming", _shirt("inflate")),
-    GradientScene("shirt_grazed", "fine mesh along which light passes",
-                  _shirt("translate", lambda: directional_light((-0.1, -1, -0.1), 2.0))),
+    GradientScene(
+        "shirt_grazed",
+        "fine mesh along which light passes",
+        _shirt("translate", lambda: directional_light((-0.1, -1, -0.1), 2.0)),
+    ),
     GradientScene("sharp_pleats", "smooth-shaded sharp folds, some faces almost edge-on", _pleats),
     GradientScene("cube_constant", "cube under a constant environment (Mitsuba #1895)", _cube),
     GradientScene("cube_flat_shaded", "creases between flat faces", _flat_cube_sky),
-    GradientScene("seam_over_rough_mirror", "texture seam over a rough mirror (#1648)", _seam_over_mirror, 3,
-                  step=0.04),
+    GradientScene(
+        "seam_over_rough_mirror", "texture seam over a rough mirror (#1648)", _seam_over_mirror, 3, step=0.04
+    ),
     GradientScene("seam_self_shadowed", "texture seam, self-shadowed (#1648)", _seam_self_shadowed),
     GradientScene("textured_area_light", "spatially varying emitter (#1506)", _textured_light(True)),
     GradientScene("many_flat_faces", "the same, flat-shaded at small angles", _textured_light(False)),
@@ -311,14 +397,18 @@ SCENES = (
     GradientScene("occluder", "static occluder in front", _occluder, step=0.02),
     GradientScene("open_box", "interreflection in an open box", _open_box, 3),
     GradientScene("thin_sheet_edge_on", "sheet seen almost from its edge", _thin_sheet, step=0.0025),
-    GradientScene("shadow_environment", "shadow on a plane, environment",
-                  _shadow_on_plane(constant), step=0.08),
-    GradientScene("shadow_area_light", "shadow on a plane, area light",
-                  _shadow_on_plane(_area_light), step=0.08),
-    GradientScene("shadow_point_light", "hard shadow, point light",
-                  _shadow_on_plane(_point_light), step=0.08),
-    GradientScene("shadow_directional", "hard shadow, directional light",
-                  _shadow_on_plane(directional_light), step=0.08),
+    GradientScene(
+        "shadow_environment", "shadow on a plane, environment", _shadow_on_plane(constant), step=0.08
+    ),
+    GradientScene(
+        "shadow_area_light", "shadow on a plane, area light", _shadow_on_plane(_area_light), step=0.08
+    ),
+    GradientScene(
+        "shadow_point_light", "hard shadow, point light", _shadow_on_plane(_point_light), step=0.08
+    ),
+    GradientScene(
+        "shadow_directional", "hard shadow, directional light", _shadow_on_plane(directional_light), step=0.08
+    ),
 )
 
 

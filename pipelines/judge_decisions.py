@@ -173,9 +173,16 @@ def fitted_openings(path: Path, config: FitConfig) -> tuple[list[Change], Surfac
             verdict = super().compare(before, after, label, where)
             # Parts are openings; one split is the refinement's second opinion.
             if before.values is after.values is None and len(self.splits) > 1 and len(after.shown.mesh[1]):
-                changes.append(Change(stage.name, verdict.gain.tolist(), verdict.noise.tolist(),
-                                      verdict.accepted.tolist(), chamfer(*before.shown.mesh, truth),
-                                      chamfer(*after.shown.mesh, truth)))
+                changes.append(
+                    Change(
+                        stage.name,
+                        verdict.gain.tolist(),
+                        verdict.noise.tolist(),
+                        verdict.accepted.tolist(),
+                        chamfer(*before.shown.mesh, truth),
+                        chamfer(*after.shown.mesh, truth),
+                    )
+                )
             return verdict
 
     given, fit_stage.Judge = fit_stage.Judge, Recording
@@ -199,9 +206,15 @@ def spoilt(fit: Fit, cell: float) -> Iterator[tuple[str, PinholeViews, list[Targ
     rng = np.random.default_rng(0)
 
     def changed(change: Callable[[np.ndarray, int], np.ndarray]) -> list[Target]:
-        return [replace(target, rgba=np.concatenate([change(target.rgba, view), target.rgba[..., 3:]],
-                                                    axis=-1).astype(np.float32))
-                for view, target in enumerate(targets)]
+        return [
+            replace(
+                target,
+                rgba=np.concatenate([change(target.rgba, view), target.rgba[..., 3:]], axis=-1).astype(
+                    np.float32
+                ),
+            )
+            for view, target in enumerate(targets)
+        ]
 
     def noisy(rgba: np.ndarray, _: int) -> np.ndarray:
         noise = rng.normal(0, _NOISE, rgba[..., :3].shape)
@@ -212,8 +225,12 @@ def spoilt(fit: Fit, cell: float) -> Iterator[tuple[str, PinholeViews, list[Targ
     turns = rng.normal(size=(len(views), 3))
     turns *= (_PIXELS * angle / np.linalg.norm(turns, axis=1))[:, None]
     yield f"poses, {_PIXELS:g} pixel", Corrections(turns, 0 * turns).views(views), targets, 0
-    scene = mi.load_dict({"type": "scene", "truth": {"type": "ply", "filename": str(
-        fit.scene.path.with_suffix("") / "truth.ply")}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "truth": {"type": "ply", "filename": str(fit.scene.path.with_suffix("") / "truth.ply")},
+        }
+    )
     waves = rng.normal(size=(64, 3))
     lengths = cell * np.exp(rng.uniform(*np.log(_WAVELENGTHS), len(waves)))
     waves *= (2 * np.pi / (lengths * np.linalg.norm(waves, axis=1)))[:, None]
@@ -230,8 +247,9 @@ def spoilt(fit: Fit, cell: float) -> Iterator[tuple[str, PinholeViews, list[Targ
     yield "texture", views, changed(textured), 0
 
 
-def holes(vertices: np.ndarray, faces: np.ndarray, opened: np.ndarray, closed: np.ndarray,
-          count: int) -> np.ndarray:
+def holes(
+    vertices: np.ndarray, faces: np.ndarray, opened: np.ndarray, closed: np.ndarray, count: int
+) -> np.ndarray:
     """(V,) which hole that is not there a vertex is in, from 0; -1 if in none.
 
     Args:
@@ -267,7 +285,7 @@ def decided_openings(path: Path, config: FitConfig, surface: Surface) -> list[di
     mesh = vertices, faces = template.closed
     opened = clean_opacity(template.logits, vertices, faces, config.topology.min_area) <= 0
     piece = mesh_components(faces, len(vertices))
-    opened &= (np.bincount(piece, ~opened) > 0)[piece]    # what is all open is no opening in anything
+    opened &= (np.bincount(piece, ~opened) > 0)[piece]  # what is all open is no opening in anything
     points, _ = trimesh.sample.sample_surface(truth, 4 * _POINTS, seed=0)
     near = cKDTree(points).query(vertices)[0] < _NEAR * cell
     true = places_of(opened, equal_patches(opened, faces))
@@ -279,9 +297,18 @@ def decided_openings(path: Path, config: FitConfig, surface: Surface) -> list[di
         right = shown.part(np.where(opened, -1.0, 1.0))
         wrong = shown.part(np.where(opened | (false >= 0), -1.0, 1.0))
         said = [judge.compare(shown.whole, right, true), judge.compare(right, wrong, false)]
-        rows.append({"images": name, **{kind: {"z": (verdict.gain / verdict.noise).tolist(),
-                                               "accepted": verdict.accepted.tolist()}
-                                        for kind, verdict in zip(("true", "false"), said, strict=True)}})
+        rows.append(
+            {
+                "images": name,
+                **{
+                    kind: {
+                        "z": (verdict.gain / verdict.noise).tolist(),
+                        "accepted": verdict.accepted.tolist(),
+                    }
+                    for kind, verdict in zip(("true", "false"), said, strict=True)
+                },
+            }
+        )
     return rows
 
 
@@ -301,20 +328,35 @@ def page(outcomes: dict[str, dict]) -> str:
     for scene, outcome in outcomes.items():
         changes += [Change(**change).row(scene) for change in outcome["changes"]]
         openings += [openings_row(scene, row) for row in outcome["openings"]]
-    return _INTRODUCTION.format(changes="\n".join(changes), openings="\n".join(openings), same=_SAME,
-                                noise=_NOISE, pixels=_PIXELS)
+    return _INTRODUCTION.format(
+        changes="\n".join(changes), openings="\n".join(openings), same=_SAME, noise=_NOISE, pixels=_PIXELS
+    )
 
 
 def main(given: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE.xml",
-                        help=f"default: {', '.join(scene.stem for scene in SCENES)}")
-    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", dest="settings",
-                        help="settings of the fits instead of the defaults")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "scenes",
+        nargs="*",
+        type=Path,
+        default=SCENES,
+        metavar="SCENE.xml",
+        help=f"default: {', '.join(scene.stem for scene in SCENES)}",
+    )
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE",
+        dest="settings",
+        help="settings of the fits instead of the defaults",
+    )
     parser.add_argument("-o", "--output", type=Path, default=Path("out/judge"), help="folder of the outcomes")
-    parser.add_argument("--page", type=Path, default=REPOSITORY / "docs" / "judge.md",
-                        help="the Markdown file to write")
+    parser.add_argument(
+        "--page", type=Path, default=REPOSITORY / "docs" / "judge.md", help="the Markdown file to write"
+    )
     arguments = parser.parse_args(given)
     ensure_variant()
     config = parsed_settings(arguments.settings)
@@ -325,8 +367,15 @@ def main(given: list[str] | None = None) -> int:
         if not stored.exists():
             print(f"{scene.stem} ...", flush=True)
             changes, surface = fitted_openings(scene, config)
-            stored.write_text(json.dumps({"changes": [vars(change) for change in changes],
-                                          "openings": decided_openings(scene, config, surface)}, indent=1))
+            stored.write_text(
+                json.dumps(
+                    {
+                        "changes": [vars(change) for change in changes],
+                        "openings": decided_openings(scene, config, surface),
+                    },
+                    indent=1,
+                )
+            )
         outcomes[scene.stem] = json.loads(stored.read_text())
         arguments.page.write_text(page(outcomes))
     return 0

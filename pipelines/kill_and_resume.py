@@ -61,9 +61,13 @@ class Run:
         self.output, self.begin = output, time.time()
         resume = ["--resume"] if (output / "checkpoint.npz").exists() else []
         command = [sys.executable, "-m", "gshell_mi.fit", str(scene), "-o", str(output), "--quiet"]
-        self.process = subprocess.Popen([*command, *options, *resume], stdout=subprocess.DEVNULL,
-                                        stderr=subprocess.PIPE, text=True,
-                                        preexec_fn=_stay_on_one_core if one_core else None)
+        self.process = subprocess.Popen(
+            [*command, *options, *resume],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=_stay_on_one_core if one_core else None,
+        )
 
     def reached(self) -> tuple[int, int]:
         """Steps logged, and files of the ending that this process has written."""
@@ -149,11 +153,19 @@ def _read_page(path: Path) -> None:
 
 
 _READERS = {
-    ".npz": Checkpoint.load, ".ply": read_ply, ".glb": trimesh.load, ".xml": ElementTree.parse,
-    ".json": lambda path: json.loads(path.read_text()), ".jsonl": _read_log, ".html": _read_page,
-    ".exr": lambda path: mi.Bitmap(str(path)), ".png": lambda path: Image.open(path).load(),
-    ".gif": lambda path: Image.open(path).load(), ".mp4": imageio_ffmpeg.count_frames_and_secs,
-    ".obj": trimesh.load, ".mtl": lambda path: path.read_text(),
+    ".npz": Checkpoint.load,
+    ".ply": read_ply,
+    ".glb": trimesh.load,
+    ".xml": ElementTree.parse,
+    ".json": lambda path: json.loads(path.read_text()),
+    ".jsonl": _read_log,
+    ".html": _read_page,
+    ".exr": lambda path: mi.Bitmap(str(path)),
+    ".png": lambda path: Image.open(path).load(),
+    ".gif": lambda path: Image.open(path).load(),
+    ".mp4": imageio_ffmpeg.count_frames_and_secs,
+    ".obj": trimesh.load,
+    ".mtl": lambda path: path.read_text(),
 }
 
 
@@ -163,12 +175,16 @@ def differences(first: Path, second: Path) -> dict[str, float]:
     a, b = (read_ply(folder / "mesh.ply").vertices for folder in (first, second))
     distance = (cKDTree(a).query(b)[0].mean() + cKDTree(b).query(a)[0].mean()) / 2
     psnr = [json.loads((folder / "metrics.json").read_text())["psnr_training"] for folder in (first, second)]
-    return {"distance %": 100 * distance / np.linalg.norm(np.ptp(a, axis=0)),
-            "PSNR dB": abs(psnr[0] - psnr[1]), "vertices": abs(len(a) - len(b))}
+    return {
+        "distance %": 100 * distance / np.linalg.norm(np.ptp(a, axis=0)),
+        "PSNR dB": abs(psnr[0] - psnr[1]),
+        "vertices": abs(len(a) - len(b)),
+    }
 
 
-def study(scene: Path, work: Path, options: list[str], *, kills: int, whole: int, seed: int,
-          one_core: bool = False) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
+def study(
+    scene: Path, work: Path, options: list[str], *, kills: int, whole: int, seed: int, one_core: bool = False
+) -> tuple[list[dict[str, float]], list[dict[str, float]]]:
     """Runs it all; the differences of the whole fits to each other, and of the killed one to them."""
     fits = [work / f"whole_{number}" for number in range(whole)]
     for folder in (*fits, work / "killed"):
@@ -181,12 +197,17 @@ def study(scene: Path, work: Path, options: list[str], *, kills: int, whole: int
     killed = work / "killed"
     for moment in moments(course, kills, random.Random(seed)):
         if run(killed).kill_at(moment):
-            print(f"killed {moment.seconds:.2f} s after {moment.steps} steps and {moment.files} files of the "
-                  f"ending; {read_everything(killed) if killed.exists() else 0} files are whole", flush=True)
+            print(
+                f"killed {moment.seconds:.2f} s after {moment.steps} steps and {moment.files} files of the "
+                f"ending; {read_everything(killed) if killed.exists() else 0} files are whole",
+                flush=True,
+            )
     run(killed).wait()
     read_everything(killed)
-    return ([differences(a, b) for a, b in itertools.combinations(fits, 2)],
-            [differences(killed, folder) for folder in fits])
+    return (
+        [differences(a, b) for a, b in itertools.combinations(fits, 2)],
+        [differences(killed, folder) for folder in fits],
+    )
 
 
 def farther(between: list[dict[str, float]], to_killed: list[dict[str, float]]) -> bool:
@@ -205,15 +226,24 @@ def main() -> int:
     parser.add_argument("--one-core", action="store_true", help="keep all threads on one core (Linux)")
     own, options = sys.argv[1:], []
     if "--" in own:
-        own, options = own[:own.index("--")], own[own.index("--") + 1:]
+        own, options = own[: own.index("--")], own[own.index("--") + 1 :]
     given = parser.parse_args(own)
     mi.set_variant("llvm_ad_rgb")
-    between, to_killed = study(given.scene, given.work, options, kills=given.kills, whole=given.whole,
-                               seed=given.seed, one_core=given.one_core)
+    between, to_killed = study(
+        given.scene,
+        given.work,
+        options,
+        kills=given.kills,
+        whole=given.whole,
+        seed=given.seed,
+        one_core=given.one_core,
+    )
     for name in between[0]:
         a, b = ([entry[name] for entry in entries] for entries in (between, to_killed))
-        print(f"{name}: whole fits differ by {np.mean(a):.3g} (at most {max(a):.3g}), "
-              f"the killed one from them by {np.mean(b):.3g} (at most {max(b):.3g})")
+        print(
+            f"{name}: whole fits differ by {np.mean(a):.3g} (at most {max(a):.3g}), "
+            f"the killed one from them by {np.mean(b):.3g} (at most {max(b):.3g})"
+        )
     return int(farther(between, to_killed))
 
 

@@ -46,13 +46,52 @@ from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint  # noqa: E402
 
 #: Some steps of every stage of a fit.
 EVERY_STAGE = (
-    "--occlusion.most", "0.1", "--openings.iterations", "40", "--openings.mask", "0.01",
-    "--openings.binary", "0.015", "--openings.closing", "0.003", "--radiance.batch", "8192",
-    "--radiance.smoothing", "8", "--cavities.iterations", "6", "--cavities.batch", "4096",
-    "--refinement.iterations", "8", "--folds.iterations", "4", "--volume.iterations", "9",
-    "--volume.side", "64", "--volume.resolution", "24", "--volume.batch", "8192", "--iterations", "10",
-    "--detail.iterations", "5", "--texture.rounds", "1", "--render.spp", "2", "--render.primal-spp", "4",
-    "--render.max-depth", "2", "--model.light-height", "8", "--no-report")
+    "--occlusion.most",
+    "0.1",
+    "--openings.iterations",
+    "40",
+    "--openings.mask",
+    "0.01",
+    "--openings.binary",
+    "0.015",
+    "--openings.closing",
+    "0.003",
+    "--radiance.batch",
+    "8192",
+    "--radiance.smoothing",
+    "8",
+    "--cavities.iterations",
+    "6",
+    "--cavities.batch",
+    "4096",
+    "--refinement.iterations",
+    "8",
+    "--folds.iterations",
+    "4",
+    "--volume.iterations",
+    "9",
+    "--volume.side",
+    "64",
+    "--volume.resolution",
+    "24",
+    "--volume.batch",
+    "8192",
+    "--iterations",
+    "10",
+    "--detail.iterations",
+    "5",
+    "--texture.rounds",
+    "1",
+    "--render.spp",
+    "2",
+    "--render.primal-spp",
+    "4",
+    "--render.max-depth",
+    "2",
+    "--model.light-height",
+    "8",
+    "--no-report",
+)
 
 #: The command's words, and the folder or file that holds its result; {} is the place of all.
 COMMANDS = {
@@ -60,10 +99,14 @@ COMMANDS = {
     "export": (["export", "{}/fit", "--obj", "--texture-size", "256"], "fit"),
     "turntable": (["turntable", "{}/fit", "--frames", "8", "--size", "64", "--quiet"], "fit"),
     "report": (["report", "{}/fit", "--turntable-frames", "4", "--turntable-size", "64"], "fit"),
-    "dataset": (["dataset", "-o", "{}/data", "--garments", "3", "--side", "16", "--max-chamfer", "50",
-                 "--quiet"], "data"),
-    "fit": (["fit", "{}/in/bowl.xml", "-o", "{}/out", "--quiet", "--checkpoint-seconds", "0", *EVERY_STAGE],
-            "out"),
+    "dataset": (
+        ["dataset", "-o", "{}/data", "--garments", "3", "--side", "16", "--max-chamfer", "50", "--quiet"],
+        "data",
+    ),
+    "fit": (
+        ["fit", "{}/in/bowl.xml", "-o", "{}/out", "--quiet", "--checkpoint-seconds", "0", *EVERY_STAGE],
+        "out",
+    ),
 }
 
 #: Metrics that no two runs have in common.
@@ -98,8 +141,10 @@ class Row:
 
     def __str__(self) -> str:
         stages = "".join(f", {count} in {stage}" for stage, count in self.stages.items())
-        return (f"| {self.name} | {self.seconds:.1f} s | {self.killed}{stages} | {self.read} | "
-                f"{self.compared} | {'; '.join(self.wrong) or 'none'} |")
+        return (
+            f"| {self.name} | {self.seconds:.1f} s | {self.killed}{stages} | {self.read} | "
+            f"{self.compared} | {'; '.join(self.wrong) or 'none'} |"
+        )
 
 
 def prepare(folder: Path) -> None:
@@ -108,11 +153,19 @@ def prepare(folder: Path) -> None:
     _spoil(scene)
     (folder / "fit").mkdir()
     write_fit(folder / "fit", open_sphere(3))
-    (folder / "fit" / "metrics.json").write_text(json.dumps({
-        "scene": "a.xml", "psnr_training": 30.0, "versions": {}, "config": {},
-        "training": {"views": {}, "mean": {"psnr": 30.0}},
-        "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1},
-        "seconds": {"total": 1.0}}))
+    (folder / "fit" / "metrics.json").write_text(
+        json.dumps(
+            {
+                "scene": "a.xml",
+                "psnr_training": 30.0,
+                "versions": {},
+                "config": {},
+                "training": {"views": {}, "mean": {"psnr": 30.0}},
+                "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1},
+                "seconds": {"total": 1.0},
+            }
+        )
+    )
     (folder / "set").mkdir()
     for path in scene.with_suffix("").glob("*.exr"):
         shutil.copy(path, folder / "set")
@@ -140,7 +193,7 @@ def _spoil(scene: Path) -> None:
     turned.unlink()
     hidden = scene.with_suffix("") / "view_005.exr"
     pixels = np.array(mi.Bitmap(str(hidden)))
-    pixels[SIZE // 2:] = 0
+    pixels[SIZE // 2 :] = 0
     mi.Bitmap(pixels).write(str(hidden))
 
 
@@ -161,12 +214,20 @@ def run(words: list[str], seconds: float | None = None) -> tuple[float, bool]:
         RuntimeError: it has failed by itself.
     """
     begin, spent = time.monotonic(), 0.0
-    script = [str(ROOT / "pipelines" / "one_thread_fit.py")] if words[0] == "fit" else [
-        "-m", f"gshell_mi.{words[0]}"]
+    script = (
+        [str(ROOT / "pipelines" / "one_thread_fit.py")]
+        if words[0] == "fit"
+        else ["-m", f"gshell_mi.{words[0]}"]
+    )
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryFile("w+") as told:
-        process = subprocess.Popen([sys.executable, *script, *words[1:]], stdout=subprocess.DEVNULL,
-                                   stderr=told, cwd=ROOT, env=environment)
+        process = subprocess.Popen(
+            [sys.executable, *script, *words[1:]],
+            stdout=subprocess.DEVNULL,
+            stderr=told,
+            cwd=ROOT,
+            env=environment,
+        )
         while process.poll() is None:
             spent = max(spent, _spent(process.pid, begin))
             if seconds is not None and spent >= seconds:
@@ -185,7 +246,7 @@ def _spent(pid: int, begin: float) -> float:
     since ``begin`` where no system tells."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:    # it ends just now, or there is no such file
+    except OSError:  # it ends just now, or there is no such file
         return 0.0 if Path("/proc/self/stat").exists() else time.monotonic() - begin
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
@@ -195,7 +256,7 @@ def kill(name: str, folder: Path, kills: int, seed: int = 0) -> Row:
     command, place = COMMANDS[name]
     words, place = [word.format(folder) for word in command], folder / place
     row, before, whole = Row(name), _inputs(folder), []
-    for number in range(2):    # the first one compiles
+    for number in range(2):  # the first one compiles
         row.seconds, _ = run(words + _going_on(name, place))
         whole.append(shutil.copytree(place, folder / f"whole_{number}"))
     row.wrong += [f"whole runs: {what}" for what in _different(name, whole[1], whole[0])]
@@ -203,7 +264,7 @@ def kill(name: str, folder: Path, kills: int, seed: int = 0) -> Row:
     for number in range(kills + 1):
         last = number == kills
         if last:
-            time.sleep(1.1)    # what was being written just now may still be
+            time.sleep(1.1)  # what was being written just now may still be
         _, killed = run(words + _going_on(name, place), None if last else rng.uniform(0.1, 1) * row.seconds)
         row.killed += killed
         if killed and name == "fit":
@@ -224,7 +285,7 @@ def kill(name: str, folder: Path, kills: int, seed: int = 0) -> Row:
 def _going_on(name: str, place: Path) -> list[str]:
     """How a command is told what to do with what is there."""
     if name == "dataset" and place.is_dir() and (place / "statistics.json").is_file():
-        shutil.rmtree(place)    # it is whole, and made anew
+        shutil.rmtree(place)  # it is whole, and made anew
     if name != "fit":
         return []
     if (place / ".unfinished" / "checkpoint.npz").is_file():
@@ -236,8 +297,11 @@ def _going_on(name: str, place: Path) -> list[str]:
 
 def _inputs(folder: Path) -> dict[str, bytes]:
     """What no command may change."""
-    paths = [*(folder / "in").rglob("*"), *(folder / "set").rglob("*"),
-             *(folder / name / "notes.json" for name in ("out", "fit"))]
+    paths = [
+        *(folder / "in").rglob("*"),
+        *(folder / "set").rglob("*"),
+        *(folder / name / "notes.json" for name in ("out", "fit")),
+    ]
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths if path.is_file()}
 
 
@@ -269,22 +333,30 @@ def _content(name: str, place: Path) -> dict[str, Any]:
         return {"mesh.glb": np.round(np.sort(mesh.vertices, axis=0), 5)}
     if name == "report":
         return {"report.html": (place / "report.html").read_text(encoding="utf-8").count("data:")}
-    found: dict[str, Any] = {file: path.read_bytes() for file, path in files.items()
-                             if path.suffix not in (".json", ".jsonl", ".npz")}
+    found: dict[str, Any] = {
+        file: path.read_bytes()
+        for file, path in files.items()
+        if path.suffix not in (".json", ".jsonl", ".npz")
+    }
     if name == "dataset":
         arrays = {file: dict(np.load(path)) for file, path in files.items() if path.suffix == ".npz"}
-        return {f"{array} of {file}": values for file, each in arrays.items()
-                for array, values in each.items()}
+        return {
+            f"{array} of {file}": values for file, each in arrays.items() for array, values in each.items()
+        }
     if name == "fit":
         checkpoint = Checkpoint.load(place / "checkpoint.npz")
         found |= {f"{array} of the checkpoint": values for array, values in checkpoint.arrays.items()}
         found |= {"facts of the checkpoint": checkpoint.facts, "stage of the checkpoint": checkpoint.stage}
         metrics = json.loads((place / "metrics.json").read_text())
-        found |= {f"{metric} of the metrics": value for metric, value in metrics.items()
-                  if metric not in _OF_THE_RUN}
+        found |= {
+            f"{metric} of the metrics": value
+            for metric, value in metrics.items()
+            if metric not in _OF_THE_RUN
+        }
         lines = map(json.loads, (place / "log.jsonl").read_text().splitlines())
-        found["log.jsonl"] = [{key: value for key, value in line.items() if key != "seconds"}
-                              for line in lines]
+        found["log.jsonl"] = [
+            {key: value for key, value in line.items() if key != "seconds"} for line in lines
+        ]
     return found
 
 
@@ -298,8 +370,12 @@ def main(arguments: list[str] | None = None) -> int:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    print("| command | a whole run | kills | files read whole | results compared | wrong |\n"
-          + "|---" * 6 + "|", flush=True)
+    print(
+        "| command | a whole run | kills | files read whole | results compared | wrong |\n"
+        + "|---" * 6
+        + "|",
+        flush=True,
+    )
     rows = []
     for name in given.commands or COMMANDS:
         with tempfile.TemporaryDirectory() as folder:

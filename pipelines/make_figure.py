@@ -1,6 +1,6 @@
 """A figure of a fit: target, fit and bare mesh from a few views; back faces in orange as in the paper.
 
-    python pipelines/make_figure.py SCENE.xml OUT FIGURE.png [--views view_010 view_024 ...]
+python pipelines/make_figure.py SCENE.xml OUT FIGURE.png [--views view_010 view_024 ...]
 """
 
 from __future__ import annotations
@@ -19,14 +19,18 @@ FRONT, BACK = (0.75, 0.78, 0.82), (0.90, 0.42, 0.10)
 
 def bare_mesh(path: Path) -> mi.Scene:
     """The mesh alone under a soft key light."""
-    sides = {side: {"type": "diffuse", "reflectance": {"type": "rgb", "value": color}}
-             for side, color in (("front", FRONT), ("back", BACK))}
-    return mi.load_dict({
-        "type": "scene",
-        "mesh": {"type": "ply", "filename": str(path), "bsdf": {"type": "twosided", **sides}},
-        "ambient": {"type": "constant", "radiance": 0.5},
-        "key": {"type": "directional", "direction": [-0.4, -1.0, -0.6], "irradiance": 1.3},
-    })
+    sides = {
+        side: {"type": "diffuse", "reflectance": {"type": "rgb", "value": color}}
+        for side, color in (("front", FRONT), ("back", BACK))
+    }
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "mesh": {"type": "ply", "filename": str(path), "bsdf": {"type": "twosided", **sides}},
+            "ambient": {"type": "constant", "radiance": 0.5},
+            "key": {"type": "directional", "direction": [-0.4, -1.0, -0.6], "irradiance": 1.3},
+        }
+    )
 
 
 def main() -> None:
@@ -44,10 +48,12 @@ def main() -> None:
     rows = []
     for name in given.views:
         target = mi.Bitmap(str(given.scene.with_suffix("") / f"{name}.exr")).convert(
-            component_format=mi.Struct.Type.Float32)
+            component_format=mi.Struct.Type.Float32
+        )
         images = [np.array(target)] + [
             np.array(mi.render(scene, sensor=sensors[name], integrator=integrator, spp=given.spp))
-            for scene in (fitted, mesh)]
+            for scene in (fitted, mesh)
+        ]
         rows.append(np.concatenate([over_white(image) for image in images], axis=1))
     given.figure.parent.mkdir(parents=True, exist_ok=True)
     write_png(given.figure, np.concatenate(rows, axis=0))

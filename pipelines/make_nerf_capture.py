@@ -38,8 +38,9 @@ def to_png(image: np.ndarray, path: Path) -> None:
     Image.fromarray((rgba * 255 + 0.5).astype(np.uint8)).save(path)
 
 
-def write_split(scene: mi.Scene, folder: Path, split: str, poses: list[np.ndarray], size: int,
-                spp: int) -> None:
+def write_split(
+    scene: mi.Scene, folder: Path, split: str, poses: list[np.ndarray], size: int, spp: int
+) -> None:
     (folder / split).mkdir(parents=True, exist_ok=True)
     frames = []
     for index, pose in enumerate(poses):

@@ -41,11 +41,17 @@ def main(given: list[str] | None = None) -> int:
     texts = field_texts(Faults)
     for field in dataclasses.fields(Faults):
         text = texts[field.name].replace("%", "%%")
-        parser.add_argument(f"--{field.name.replace('_', '-')}", type=type(field.default),
-                            help=f"{text} (default {field.default:g})")
+        parser.add_argument(
+            f"--{field.name.replace('_', '-')}",
+            type=type(field.default),
+            help=f"{text} (default {field.default:g})",
+        )
     arguments = parser.parse_args(given)
-    chosen = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(Faults)
-              if getattr(arguments, field.name) is not None}
+    chosen = {
+        field.name: getattr(arguments, field.name)
+        for field in dataclasses.fields(Faults)
+        if getattr(arguments, field.name) is not None
+    }
 
     def progress(done: int, count: int) -> None:
         print(f"\r{done} / {count}", end="\n" if done == count else "", file=sys.stderr, flush=True)
@@ -55,8 +61,9 @@ def main(given: list[str] | None = None) -> int:
         ensure_variant(arguments.variant)
         from scene_builder.photographs import Photographs, write_photographs
 
-        what = Photographs(arguments.reference, faults, arguments.views, arguments.size, arguments.spp,
-                           arguments.seed)
+        what = Photographs(
+            arguments.reference, faults, arguments.views, arguments.size, arguments.spp, arguments.seed
+        )
         write_photographs(what, arguments.output, progress)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -34,8 +34,10 @@ ELEVATIONS = (18.0, 48.0)
 def pattern(size: int = 1024) -> mi.Bitmap:
     """A table cloth of spots of several sizes and colours, linear RGB."""
     rng = np.random.default_rng(3)
-    layers = [ndimage.gaussian_filter(rng.standard_normal((size, size, 3)), (s, s, 0), mode="wrap") * s
-              for s in (3, 8, 24)]
+    layers = [
+        ndimage.gaussian_filter(rng.standard_normal((size, size, 3)), (s, s, 0), mode="wrap") * s
+        for s in (3, 8, 24)
+    ]
     return mi.Bitmap((0.35 + 0.25 * np.tanh(2 * sum(layers))).astype(np.float32))
 
 
@@ -46,20 +48,28 @@ def furnished(reference: Path) -> mi.Scene:
     width = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
     place = mi.ScalarTransform4f().translate([0, float(box.min[1]) - 1e-3, 0]).rotate([1, 0, 0], -90)
     cloth = {"type": "bitmap", "bitmap": pattern(), "raw": True}
-    return mi.load_dict({
-        "type": "scene", "integrator": {"type": "path", "max_depth": 4},
-        **{f"object_{k}": shape for k, shape in enumerate(stock.shapes())},
-        **{f"light_{k}": light for k, light in enumerate(stock.emitters())},
-        "table": {"type": "rectangle", "to_world": place.scale(1.6 * width),
-                  "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": cloth}}}})
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 4},
+            **{f"object_{k}": shape for k, shape in enumerate(stock.shapes())},
+            **{f"light_{k}": light for k, light in enumerate(stock.emitters())},
+            "table": {
+                "type": "rectangle",
+                "to_world": place.scale(1.6 * width),
+                "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": cloth}},
+            },
+        }
+    )
 
 
 def pose(turn: float, target: np.ndarray, distance: float) -> np.ndarray:
     low, high = np.radians(ELEVATIONS)
     azimuth = 2 * np.pi * turn
     elevation = low + (high - low) * (0.5 - 0.5 * np.cos(3 * azimuth))
-    direction = np.array([np.cos(elevation) * np.sin(azimuth), np.sin(elevation),
-                          np.cos(elevation) * np.cos(azimuth)])
+    direction = np.array(
+        [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+    )
     return look_at(target + distance * direction, target)
 
 

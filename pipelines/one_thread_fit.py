@@ -21,6 +21,7 @@ def _one_thread(variant: str) -> None:
 
 def _on_two(work: Callable[..., Any]) -> Callable[..., Any]:
     """The same with a second thread for a while: Mitsuba waits for it to read and write OpenEXR files."""
+
     @wraps(work)
     def done(*arguments: Any, **options: Any) -> Any:
         dr.set_thread_count(2)

@@ -44,8 +44,9 @@ def joint_stage(scene: Path, output: Path):
     return JointStage(loaded, fitted.material, fitted.light, config)
 
 
-def seconds_per_phase(joint, first: int, count: int,
-                      clock: Callable[[], float]) -> tuple[dict[str, float], float]:
+def seconds_per_phase(
+    joint, first: int, count: int, clock: Callable[[], float]
+) -> tuple[dict[str, float], float]:
     """Mean seconds per phase of an iteration, and of an iteration that nobody interrupts."""
     from gshell_mi.timing import Stopwatch
 
@@ -67,8 +68,11 @@ def table(seconds: dict[str, float], free: float) -> str:
     for name, spent in sorted(seconds.items(), key=lambda item: -item[1]):
         rows.append(f"| {name} | {1e3 * spent:.0f} | {spent / total:.1%} |")
     others = 1 - sum(seconds.get(name, 0) for name in _RENDERING) / total
-    rows += ["", f"Everything but rendering: {others:.1%}. An iteration without the stopwatch takes "
-                 f"{1e3 * free:.0f} ms, with it {1e3 * total:.0f} ms."]
+    rows += [
+        "",
+        f"Everything but rendering: {others:.1%}. An iteration without the stopwatch takes "
+        f"{1e3 * free:.0f} ms, with it {1e3 * total:.0f} ms.",
+    ]
     return "\n".join(rows)
 
 

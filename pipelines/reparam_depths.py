@@ -53,27 +53,36 @@ def measure(case: gradient_scenes.GradientScene, resolution: int, seconds: float
 
     def figure(image_of_seed, least):
         values = []
-        repeat(lambda seed: float((image_of_seed(seed)[..., :3] * weights).sum()), values, FINE, seconds,
-               least)
+        repeat(
+            lambda seed: float((image_of_seed(seed)[..., :3] * weights).sum()), values, FINE, seconds, least
+        )
         return mean_and_error(values), len(values)
 
     truth, _ = figure(lambda seed: SurfaceImage(mover, case, POINTS, seed).difference(case.step), 6)
     rows, unit = [], None
     for reparam_depth in range(1, case.depth + 1):
-        integrator = mi.load_dict({"type": "gshell_path", "max_depth": case.depth, "hide_emitters": True,
-                                   "reparam_depth": reparam_depth})
+        integrator = mi.load_dict(
+            {
+                "type": "gshell_path",
+                "max_depth": case.depth,
+                "hide_emitters": True,
+                "reparam_depth": reparam_depth,
+            }
+        )
 
         def forward(seed, integrator=integrator):
             return gradient_scenes.forward_image(mover, integrator, SPP, seed)
 
-        forward(0)    # compiles
+        forward(0)  # compiles
         begin = time.process_time()
         found, count = figure(forward, 8)
         each = (time.process_time() - begin) / count
         unit = unit or each
-        rows.append(f"| {case.name} | {case.depth} | {truth[0]:.0f} ± {truth[1]:.0f} | {reparam_depth} | "
-                    f"{found[0]:.0f} ± {found[1]:.0f} | {100 * (found[0] / truth[0] - 1):+.1f} % | "
-                    f"{'yes' if agree(truth, found) else '**no**'} | {each / unit:.2f} |")
+        rows.append(
+            f"| {case.name} | {case.depth} | {truth[0]:.0f} ± {truth[1]:.0f} | {reparam_depth} | "
+            f"{found[0]:.0f} ± {found[1]:.0f} | {100 * (found[0] / truth[0] - 1):+.1f} % | "
+            f"{'yes' if agree(truth, found) else '**no**'} | {each / unit:.2f} |"
+        )
         print(rows[-1], flush=True)
     return rows
 
@@ -83,8 +92,9 @@ def main() -> None:
     parser.add_argument("meshes", nargs="*", help=f"folders of scenes/ (default {' '.join(MESHES)})")
     parser.add_argument("--depths", nargs="*", type=int, default=[2, 3], help="max_depth (default 2 3)")
     parser.add_argument("--resolution", type=int, default=48, help="pixels per side (default 48)")
-    parser.add_argument("--seconds", type=float, default=20,
-                        help="greatest processor time of a figure (default 20)")
+    parser.add_argument(
+        "--seconds", type=float, default=20, help="greatest processor time of a figure (default 20)"
+    )
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default llvm_ad_rgb)")
     arguments = parser.parse_args()
     mi.set_variant(arguments.variant)

@@ -48,10 +48,12 @@ def page(scenes: list[Path], base: FitConfig, output: Path, options: str) -> str
 
 
 def main(given: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_common_arguments(parser, sorted((REPOSITORY / "scenes").glob("*.xml")), "out/scenes",
-                         REPOSITORY / "docs" / "scenes.md")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_common_arguments(
+        parser, sorted((REPOSITORY / "scenes").glob("*.xml")), "out/scenes", REPOSITORY / "docs" / "scenes.md"
+    )
     arguments = parser.parse_args(given)
 
     def trials(base: FitConfig) -> list[Trial]:

@@ -12,8 +12,12 @@ import griffe
 def shown(text: str) -> str:
     """A docstring with its doctests as code, and what is returned as a paragraph: it is told in prose here,
     whose first colon does not end a type."""
-    text = re.sub(r"^Returns:\n((?:    .*(?:\n|$))+)",
-                  lambda found: f"**Returns:** {textwrap.dedent(found[1])}", text, flags=re.M)
+    text = re.sub(
+        r"^Returns:\n((?:    .*(?:\n|$))+)",
+        lambda found: f"**Returns:** {textwrap.dedent(found[1])}",
+        text,
+        flags=re.M,
+    )
     lines: list[str] = []
     indent: str | None = None
     for line in [*text.split("\n"), ""]:
@@ -38,7 +42,7 @@ def comment_at(lines: list[str], number: int) -> str:
     if behind := re.search(r"#: (.*)", lines[number - 1]):
         return behind[1]
     above = []
-    for line in reversed(lines[:number - 1]):
+    for line in reversed(lines[: number - 1]):
         if not (comment := re.fullmatch(r"\s*#: ?(.*)", line)):
             break
         above.append(comment[1])

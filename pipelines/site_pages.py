@@ -24,33 +24,90 @@ OWN_FILES = {"index.md": "README.md", "contributing.md": "CONTRIBUTING.md", "cha
 #: Pages of the library: title, what is said first, and the modules and packages that each describes.
 LIBRARY = {
     "lattice": ("Lattices", "Where the fields live.", ["lattice", "arrays", "bricks"]),
-    "fields": ("Fields", "Signed distances on a lattice, and how they begin.",
-               ["fields", "template", "parametrisation", "activations"]),
+    "fields": (
+        "Fields",
+        "Signed distances on a lattice, and how they begin.",
+        ["fields", "template", "parametrisation", "activations"],
+    ),
     "extraction": ("Extraction", "From fields to meshes, with derivatives.", ["extraction"]),
-    "mesh": ("Meshes", "From meshes back to fields; what meshes are like.",
-             ["conversion", "mesh_files", "topology", "triangles", "visibility", "coincident", "subdivision",
-              "diagnostics"]),
+    "mesh": (
+        "Meshes",
+        "From meshes back to fields; what meshes are like.",
+        [
+            "conversion",
+            "mesh_files",
+            "topology",
+            "triangles",
+            "visibility",
+            "coincident",
+            "subdivision",
+            "diagnostics",
+        ],
+    ),
     "shape": ("The shape plugin", "`gshell` for Mitsuba.", ["shape", "plugins", "compat"]),
-    "integrators": ("Integrators", "`gshell_path` and `gshell_mask` for Mitsuba.",
-                    ["integrators.gshell_path", "integrators.gshell_mask", "integrators"]),
+    "integrators": (
+        "Integrators",
+        "`gshell_path` and `gshell_mask` for Mitsuba.",
+        ["integrators.gshell_path", "integrators.gshell_mask", "integrators"],
+    ),
     "capture": ("Capture", "From photographs to fit scenes.", ["capture"]),
-    "scene": ("Fit scenes", "What a fit starts from, and files that anybody may have written.",
-              ["scene", "targets", "views", "pixels", "packed_pixels", "scene_files", "scene_inputs",
-               "images", "float_images", "integer_images", "plain_float_images", "environment_maps",
-               "json_files"]),
+    "scene": (
+        "Fit scenes",
+        "What a fit starts from, and files that anybody may have written.",
+        [
+            "scene",
+            "targets",
+            "views",
+            "pixels",
+            "packed_pixels",
+            "scene_files",
+            "scene_inputs",
+            "images",
+            "float_images",
+            "integer_images",
+            "plain_float_images",
+            "environment_maps",
+            "json_files",
+        ],
+    ),
     "fit": ("Fit", "From scenes to surfaces, materials and light.", ["fit"]),
-    "losses": ("Losses, material, light", "What a fit minimises, and what it changes beside the surface.",
-               ["losses", "means", "material", "light", "extras", "schedules",
-                "outliers", "tempered_adam"]),
+    "losses": (
+        "Losses, material, light",
+        "What a fit minimises, and what it changes beside the surface.",
+        ["losses", "means", "material", "light", "extras", "schedules", "outliers", "tempered_adam"],
+    ),
     "evaluation": ("Evaluation", "How good a result is.", ["evaluation", "compare"]),
-    "export": ("Export", "What a fit leaves behind, and what can be made of it.",
-               ["export", "turntable", "report", "viewer"]),
-    "generation": ("Generation", "Data sets of surfaces, models of them, and new surfaces.",
-                   ["generation", "dataset", "train", "generate"]),
+    "export": (
+        "Export",
+        "What a fit leaves behind, and what can be made of it.",
+        ["export", "turntable", "report", "viewer"],
+    ),
+    "generation": (
+        "Generation",
+        "Data sets of surfaces, models of them, and new surfaces.",
+        ["generation", "dataset", "train", "generate"],
+    ),
     "batch": ("Many jobs", "Fits by the thousand.", ["batch"]),
-    "commands": ("Commands and machine", "What the commands share, and what the machine can do.",
-                 ["command_line", "streams", "interrupt", "lifetime", "errors", "files", "own_folder",
-                  "memory", "kernel_cache", "timing", "wording", "progress", "bars", "doctor"]),
+    "commands": (
+        "Commands and machine",
+        "What the commands share, and what the machine can do.",
+        [
+            "command_line",
+            "streams",
+            "interrupt",
+            "lifetime",
+            "errors",
+            "files",
+            "own_folder",
+            "memory",
+            "kernel_cache",
+            "timing",
+            "wording",
+            "progress",
+            "bars",
+            "doctor",
+        ],
+    ),
 }
 
 #: Packages of which only the modules right inside are described: what lies deeper may change.
@@ -72,15 +129,23 @@ def public_modules(folder: Path = ROOT / "gshell_mi") -> list[str]:
 def modules_of(page: str) -> list[str]:
     """The modules that a page of the library describes: of each package first itself, then its modules."""
     modules = public_modules()
-    found = [module for room in LIBRARY[page][2]
-             for module in modules if module == room or module.startswith(f"{room}.")]
+    found = [
+        module
+        for room in LIBRARY[page][2]
+        for module in modules
+        if module == room or module.startswith(f"{room}.")
+    ]
     return list(dict.fromkeys(found))
 
 
 def exports(package: Path) -> list[str]:
     """The names that a package imports from its modules, but those that a module of it has, too."""
-    names = [name.name for statement in ast.parse((package / "__init__.py").read_text()).body
-             if isinstance(statement, ast.ImportFrom) and statement.level for name in statement.names]
+    names = [
+        name.name
+        for statement in ast.parse((package / "__init__.py").read_text()).body
+        if isinstance(statement, ast.ImportFrom) and statement.level
+        for name in statement.names
+    ]
     return [name for name in names if not (package / f"{name}.py").exists()]
 
 

@@ -34,7 +34,7 @@ class SurfaceImage:
         self.scene = mover.scene
         self.sensor = self.scene.sensors()[0]
         self.to_camera = self.sensor.world_transform().inverse()
-        fov = mi.traverse(self.sensor)["x_fov"]    # of a film without crop window
+        fov = mi.traverse(self.sensor)["x_fov"]  # of a film without crop window
         self.focal_length = self.sensor.film().size().x / 2 / dr.tan(dr.deg2rad(fov) / 2)
         self.integrator = mi.load_dict({"type": "path", "max_depth": case.depth, "hide_emitters": True})
         random = np.random.default_rng(seed)
@@ -80,7 +80,8 @@ class SurfaceImage:
         """Film positions of the points of a mesh, which of them are seen, and their channels."""
         x, uv, inside, area = self._project(mesh, *points)
         ray, _ = self.sensor.sample_ray_differential(
-            0.0, 0.0, uv / mi.Point2f(self.sensor.film().crop_size()), mi.Point2f(0.5))
+            0.0, 0.0, uv / mi.Point2f(self.sensor.film().crop_size()), mi.Point2f(0.5)
+        )
         to_point = mi.Ray3f(ray.o, ray.d, dr.norm(x - ray.o) * (1 - _TOLERANCE), 0.0, mi.Color0f())
         seen = inside & ~self.scene.ray_test(to_point, inside)
         sampler = mi.load_dict({"type": "independent"})
@@ -90,8 +91,14 @@ class SurfaceImage:
 
     def _splat(self, samples, channels):
         film = self.sensor.film()
-        block = mi.ImageBlock(film.crop_size(), film.crop_offset(), channels, rfilter=film.rfilter(),
-                              border=False, coalesce=False)
+        block = mi.ImageBlock(
+            film.crop_size(),
+            film.crop_offset(),
+            channels,
+            rfilter=film.rfilter(),
+            border=False,
+            coalesce=False,
+        )
         for u, active, values in samples:
             block.put(u + mi.Vector2f(film.crop_offset()), values, active)
         return np.array(block.tensor(), np.float64)

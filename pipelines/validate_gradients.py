@@ -106,19 +106,32 @@ def measure(case, resolution, seconds, few_error, parts):
     def projected(name):
         options = {"max_depth": case.depth} if name == "prb_projective" else {}
         integrator = mi.load_dict({"type": name, "hide_emitters": True, **options})
-        measured(name, lambda seed: gradient_scenes.forward_image(mover, integrator, 16, seed), COARSE,
-                 seconds / 4, least=4)
+        measured(
+            name,
+            lambda seed: gradient_scenes.forward_image(mover, integrator, 16, seed),
+            COARSE,
+            seconds / 4,
+            least=4,
+        )
 
     if "fd" in parts:
+
         def difference(step):
             return lambda seed: SurfaceImage(mover, case, POINTS, seed).difference(step)
 
         measured("fd", difference(case.step), FINE, seconds)
         measured("half step", difference(case.step / 2), COARSE, seconds / 2)
     if "ours" in parts:
+
         def ours(light_edge_samples):
-            return mi.load_dict({"type": "gshell_path", "max_depth": case.depth, "hide_emitters": True,
-                                 "light_edge_samples": light_edge_samples})
+            return mi.load_dict(
+                {
+                    "type": "gshell_path",
+                    "max_depth": case.depth,
+                    "hide_emitters": True,
+                    "light_edge_samples": light_edge_samples,
+                }
+            )
 
         def forward(integrator, spp, first_seed=0):
             return lambda seed: gradient_scenes.forward_image(mover, integrator, spp, first_seed + seed)
@@ -135,7 +148,7 @@ def measure(case, resolution, seconds, few_error, parts):
                 continue
             try:
                 projected(name)
-            except Exception as error:    # a stock integrator that cannot do a scene is a result
+            except Exception as error:  # a stock integrator that cannot do a scene is a result
                 row[name] = f"fails: {type(error).__name__}"
     RESULTS.mkdir(parents=True, exist_ok=True)
     np.savez(stored_at(case, resolution), row=json.dumps(row), **{f"image {k}": v for k, v in images.items()})
@@ -151,8 +164,11 @@ def recall(case, resolution):
     if not path.exists():
         return {}
     with np.load(path) as data:
-        return {"case": case, "row": json.loads(str(data["row"])),
-                "images": {k[6:]: data[k] for k in data if k.startswith("image ")}}
+        return {
+            "case": case,
+            "row": json.loads(str(data["row"])),
+            "images": {k[6:]: data[k] for k in data if k.startswith("image ")},
+        }
 
 
 def agree(a, b, share=0.01):
@@ -174,10 +190,14 @@ def format_row(kept):
 
     cells = [case.name, str(case.depth), f"{case.step:g}", number("fd"), number("half step"), number("ours")]
     if "fd" in means and "ours" in means:
-        cells += [f"{100 * (means['ours'][0] / means['fd'][0] - 1):+.1f} %",
-                  "yes" if agree(means["fd"], means["ours"]) else "**no**", number("few"),
-                  "yes" if agree(means["fd"], means["few"]) else "**no**",
-                  f"{correlation(images['fd'], images['ours']):.3f}", f"{row['mismatch']:.0e}"]
+        cells += [
+            f"{100 * (means['ours'][0] / means['fd'][0] - 1):+.1f} %",
+            "yes" if agree(means["fd"], means["ours"]) else "**no**",
+            number("few"),
+            "yes" if agree(means["fd"], means["few"]) else "**no**",
+            f"{correlation(images['fd'], images['ours']):.3f}",
+            f"{row['mismatch']:.0e}",
+        ]
     else:
         cells += [""] * 6
     return "| " + " | ".join(cells + [stock(name) for name in STOCK]) + " |"
@@ -199,8 +219,21 @@ settings at 16 spp (in brackets their correlation).
 
 """
 
-COLUMNS = ("scene", "depth", "h", "FD", "FD, h/2", f"gshell_path, {SPP} spp", "bias", "right", f"{FEW} spp",
-           "right", "corr.", "fwd - rev", *STOCK)
+COLUMNS = (
+    "scene",
+    "depth",
+    "h",
+    "FD",
+    "FD, h/2",
+    f"gshell_path, {SPP} spp",
+    "bias",
+    "right",
+    f"{FEW} spp",
+    "right",
+    "corr.",
+    "fwd - rev",
+    *STOCK,
+)
 
 
 def rows_on_page(path):
@@ -226,15 +259,24 @@ def write_page(measured, resolution):
         scale = max(np.percentile(np.abs(gaussian_filter(reference[..., :3], (1, 1, 0))), 99), 1e-6)
         strip = np.concatenate([red_and_blue(x, scale) for x in (reference, ours, ours - reference)], 1)
         mi.Bitmap((255 * strip.repeat(2, 0).repeat(2, 1)).astype(np.uint8)).write(
-            str(folder / f"gradients_{kept['case'].name}.png"))
-    lines = [HEADER, f"{resolution}² pixels; Mitsuba {mi.__version__}, `{mi.variant()}`.\n\n",
-             f"| {' | '.join(COLUMNS)} |\n", "|---" * len(COLUMNS) + "|\n"]
+            str(folder / f"gradients_{kept['case'].name}.png")
+        )
+    lines = [
+        HEADER,
+        f"{resolution}² pixels; Mitsuba {mi.__version__}, `{mi.variant()}`.\n\n",
+        f"| {' | '.join(COLUMNS)} |\n",
+        "|---" * len(COLUMNS) + "|\n",
+    ]
     lines += [table[case.name] + "\n" for case in cases]
-    lines.append(f"\n{right} of {len(cases)} scenes are right at both numbers of samples.\n\n"
-                 "## Gradient images\n\n"
-                 "Finite differences, `gshell_path`, difference; red positive, blue negative.\n\n")
-    lines += [f"**{case.name}**: {case.about}\n\n![{case.name}](images/gradients_{case.name}.png)\n\n"
-              for case in cases]
+    lines.append(
+        f"\n{right} of {len(cases)} scenes are right at both numbers of samples.\n\n"
+        "## Gradient images\n\n"
+        "Finite differences, `gshell_path`, difference; red positive, blue negative.\n\n"
+    )
+    lines += [
+        f"**{case.name}**: {case.about}\n\n![{case.name}](images/gradients_{case.name}.png)\n\n"
+        for case in cases
+    ]
     notes = Path(__file__).with_name("gradients_notes.md")
     page.write_text(("".join(lines) + notes.read_text()).rstrip() + "\n")
 
@@ -243,14 +285,24 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--scenes", nargs="*", help="names of scenes to measure (default all)")
     parser.add_argument("--resolution", type=int, default=64, help="pixels per side (default 64)")
-    parser.add_argument("--seconds", type=float, default=25,
-                        help="greatest processor time for one figure (default 25)")
-    parser.add_argument("--few-error", type=float, default=COARSE,
-                        help="standard error, as a fraction, that ends the repeats at few samples, which may "
-                        "take twice the time of other figures (default 0.01)")
-    parser.add_argument("--parts", nargs="*", choices=PARTS, default=PARTS,
-                        help="what to measure anew (default all): finite differences, gshell_path, Mitsuba's "
-                        "projective integrators")
+    parser.add_argument(
+        "--seconds", type=float, default=25, help="greatest processor time for one figure (default 25)"
+    )
+    parser.add_argument(
+        "--few-error",
+        type=float,
+        default=COARSE,
+        help="standard error, as a fraction, that ends the repeats at few samples, which may "
+        "take twice the time of other figures (default 0.01)",
+    )
+    parser.add_argument(
+        "--parts",
+        nargs="*",
+        choices=PARTS,
+        default=PARTS,
+        help="what to measure anew (default all): finite differences, gshell_path, Mitsuba's "
+        "projective integrators",
+    )
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default llvm_ad_rgb)")
     arguments = parser.parse_args()
     mi.set_variant(arguments.variant)

@@ -11,17 +11,58 @@ VIEWS = 12
 SIZE = 48
 
 #: Options of the command that make the fit short. Those of the openings suit so small a scene and few steps.
-SHORT = ("--openings.iterations", "100", "--radiance.batch", "16384", "--radiance.smoothing", "8",
-         "--openings.mask", "0.01", "--openings.binary", "0.015", "--openings.closing", "0.003",
-         "--cavities.iterations", "10", "--cavities.batch", "4096", "--volume.iterations", "0",
-         "--refinement.iterations", "8", "--folds.iterations", "0", "--iterations", "12",
-         "--render.spp", "2", "--render.primal-spp", "4", "--render.max-depth", "2", "--texture.rounds", "0",
-         "--occlusion.most", "0",
-         "--model.light-height", "8", "--no-report")
+SHORT = (
+    "--openings.iterations",
+    "100",
+    "--radiance.batch",
+    "16384",
+    "--radiance.smoothing",
+    "8",
+    "--openings.mask",
+    "0.01",
+    "--openings.binary",
+    "0.015",
+    "--openings.closing",
+    "0.003",
+    "--cavities.iterations",
+    "10",
+    "--cavities.batch",
+    "4096",
+    "--volume.iterations",
+    "0",
+    "--refinement.iterations",
+    "8",
+    "--folds.iterations",
+    "0",
+    "--iterations",
+    "12",
+    "--render.spp",
+    "2",
+    "--render.primal-spp",
+    "4",
+    "--render.max-depth",
+    "2",
+    "--texture.rounds",
+    "0",
+    "--occlusion.most",
+    "0",
+    "--model.light-height",
+    "8",
+    "--no-report",
+)
 
 #: Added to these where openings do not matter: hardly any steps, and the template stays closed.
-CLOSED = ("--openings.iterations", "5", "--openings.rounds", "0",
-          "--cavities.iterations", "4", "--refinement.iterations", "2", "--openings.no-revise")
+CLOSED = (
+    "--openings.iterations",
+    "5",
+    "--openings.rounds",
+    "0",
+    "--cavities.iterations",
+    "4",
+    "--refinement.iterations",
+    "2",
+    "--openings.no-revise",
+)
 
 
 def half_sphere(segments: int = 32) -> trimesh.Trimesh:
@@ -29,8 +70,14 @@ def half_sphere(segments: int = 32) -> trimesh.Trimesh:
     rings = segments // 4
     angle = np.linspace(0, 2 * np.pi, segments, endpoint=False)
     polar = np.linspace(0, np.pi / 2, rings + 1)[1:]
-    points = np.stack([np.outer(np.sin(polar), np.cos(angle)), np.outer(-np.cos(polar), np.ones(segments)),
-                       np.outer(np.sin(polar), np.sin(angle))], axis=-1).reshape(-1, 3)
+    points = np.stack(
+        [
+            np.outer(np.sin(polar), np.cos(angle)),
+            np.outer(-np.cos(polar), np.ones(segments)),
+            np.outer(np.sin(polar), np.sin(angle)),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
     around = np.roll(np.arange(segments), -1)
     faces = [[0, 1 + i, 1 + around[i]] for i in range(segments)]
     for ring in range(rings - 1):
@@ -46,7 +93,8 @@ def sensors_xml(views: int = VIEWS, size: int = SIZE) -> list[str]:
     y = 1 - 2 * index / views
     angle = np.pi * (1 + 5**0.5) * index
     origins = 3 * np.stack([np.sqrt(1 - y**2) * np.cos(angle), y, np.sqrt(1 - y**2) * np.sin(angle)], axis=1)
-    return [f"""\
+    return [
+        f"""\
     <sensor type="perspective" id="view_{i:03}">
         <float name="fov" value="32"/>
         <transform name="to_world">
@@ -56,7 +104,9 @@ def sensors_xml(views: int = VIEWS, size: int = SIZE) -> list[str]:
             <integer name="width" value="{size}"/> <integer name="height" value="{size}"/>
             <string name="pixel_format" value="rgba"/>
         </film>
-    </sensor>""" for i, (x, y, z) in enumerate(origins)]
+    </sensor>"""
+        for i, (x, y, z) in enumerate(origins)
+    ]
 
 
 def write_scene(folder: Path) -> Path:

@@ -22,8 +22,7 @@ from gshell_mi.views import PinholeViews
 #: Half the side of the block, how thick the walls are, and the views' pixels per side.
 HALF, WALL, SIZE = 0.6, 0.15, 64
 
-CONFIG = FitConfig(cavities=CavitiesConfig(iterations=200, batch=16384),
-                   radiance=RadianceConfig(batch=8192))
+CONFIG = FitConfig(cavities=CavitiesConfig(iterations=200, batch=16384), radiance=RadianceConfig(batch=8192))
 
 
 def block(low, high) -> trimesh.Trimesh:
@@ -35,8 +34,12 @@ def block(low, high) -> trimesh.Trimesh:
 def cup() -> trimesh.Trimesh:
     """The upper half is hollow, open towards y = +HALF."""
     inner = HALF - WALL
-    walls = [([-HALF, 0, -HALF], [-inner, HALF, HALF]), ([inner, 0, -HALF], [HALF, HALF, HALF]),
-             ([-HALF, 0, -HALF], [HALF, HALF, -inner]), ([-HALF, 0, inner], [HALF, HALF, HALF])]
+    walls = [
+        ([-HALF, 0, -HALF], [-inner, HALF, HALF]),
+        ([inner, 0, -HALF], [HALF, HALF, HALF]),
+        ([-HALF, 0, -HALF], [HALF, HALF, -inner]),
+        ([-HALF, 0, inner], [HALF, HALF, HALF]),
+    ]
     return trimesh.util.concatenate([block([-HALF] * 3, [HALF, 0, HALF]), *(block(*ends) for ends in walls)])
 
 
@@ -53,15 +56,25 @@ def capture(shape: trimesh.Trimesh | None = None) -> tuple[PinholeViews, PixelPo
     shape = cup() if shape is None else shape
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     look_at = mi.ScalarTransform4f().look_at
-    views = PinholeViews.from_sensors([
-        mi.load_dict({"type": "perspective", "fov": 35, "film": film,
-                      "to_world": look_at((4 * d).tolist(), [0, 0, 0], [0.1, 1, 0.2])})
-        for d in trimesh.creation.icosphere(subdivisions=1).vertices])
+    views = PinholeViews.from_sensors(
+        [
+            mi.load_dict(
+                {
+                    "type": "perspective",
+                    "fov": 35,
+                    "film": film,
+                    "to_world": look_at((4 * d).tolist(), [0, 0, 0], [0.1, 1, 0.2]),
+                }
+            )
+            for d in trimesh.creation.icosphere(subdivisions=1).vertices
+        ]
+    )
     scene, targets, n = mesh_scene(shape.vertices, shape.faces), [], 4 * SIZE
     for index in range(len(views)):
         lane = dr.arange(mi.UInt32, n * n)
-        ray = views.rays(dr.full(mi.UInt32, index, n * n),
-                         mi.Point2f((lane % n + 0.5) / n, (lane // n + 0.5) / n))
+        ray = views.rays(
+            dr.full(mi.UInt32, index, n * n), mi.Point2f((lane % n + 0.5) / n, (lane // n + 0.5) / n)
+        )
         hit = scene.ray_intersect_preliminary(ray, coherent=False)
         color = dr.select(hit.is_valid(), pattern(ray(hit.t)), 0)
         samples = np.concatenate([color.numpy(), hit.is_valid().numpy()[None]]).reshape(4, SIZE, 4, SIZE, 4)
@@ -76,11 +89,20 @@ def fit_of(subject: mi.Shape, shape: trimesh.Trimesh, config: FitConfig = CONFIG
     held_out = np.arange(len(views)) % 6 == 0
     training = PixelPool(views, targets, np.flatnonzero(~held_out))
     split = [(np.flatnonzero(~held_out), np.flatnonzero(held_out))]
-    judges = [Judge(views, targets, splits, batch=config.radiance.batch)
-              for splits in (Judge.halves(len(views)), split)]
-    return SimpleNamespace(scene=SimpleNamespace(subject=subject), views=views, pixels=pixels, config=config,
-                           training=training, judge=judges[0], held_out_judge=judges[1],
-                           cell=lambda surface: surface.lattice.spacing * subject.length_scale)
+    judges = [
+        Judge(views, targets, splits, batch=config.radiance.batch)
+        for splits in (Judge.halves(len(views)), split)
+    ]
+    return SimpleNamespace(
+        scene=SimpleNamespace(subject=subject),
+        views=views,
+        pixels=pixels,
+        config=config,
+        training=training,
+        judge=judges[0],
+        held_out_judge=judges[1],
+        cell=lambda surface: surface.lattice.spacing * subject.length_scale,
+    )
 
 
 def surface_of(sdf: np.ndarray, msdf: np.ndarray, grid: str = "tet") -> Surface:

@@ -28,8 +28,9 @@ class ScriptedJudge:
         """By the mean errors of each place's vertices."""
         told = label >= 0
         number = np.maximum(np.bincount(label[told]), 1)
-        first, second = (np.bincount(label[told], self.error(opaque)[told]) / number
-                         for opaque in (before, after))
+        first, second = (
+            np.bincount(label[told], self.error(opaque)[told]) / number for opaque in (before, after)
+        )
         gain = np.log(np.maximum(first, 1e-9) / np.maximum(second, 1e-9))
         return Verdict(first, second, gain[None], np.full((1, len(gain)), self.noise))
 

@@ -23,8 +23,12 @@ def test_without_a_terminal_a_line_every_half_a_minute(monkeypatch, capfd):
         progress.update(task, total=200)
 
     found = lines(monkeypatch, capfd, work)
-    assert found == ["converting   1/100 -:--:--", "converting  16/100 0:02:48", "converting  31/100 0:02:18",
-                     "converting  46/100 0:01:48"]
+    assert found == [
+        "converting   1/100 -:--:--",
+        "converting  16/100 0:02:48",
+        "converting  31/100 0:02:18",
+        "converting  46/100 0:01:48",
+    ]
 
 
 def test_quiet(monkeypatch, capfd):

@@ -18,9 +18,13 @@ def test_rays_of_a_mesh_scene_hit_the_faces_of_the_mesh_wherever_it_is():
         inner = np.einsum("k,fkc->cf", weights, moved[faces])
         centre = np.array(shift, np.float32)[:, None]
         outside = centre + 2 * (inner - centre)
-        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(outside.astype(np.float32)),
-                                                       mi.Vector3f((centre - outside).astype(np.float32))))
+        hit = scene.ray_intersect_preliminary(
+            mi.Ray3f(
+                mi.Point3f(outside.astype(np.float32)), mi.Vector3f((centre - outside).astype(np.float32))
+            )
+        )
         np.testing.assert_array_equal(hit.prim_index, np.arange(len(faces)))
         np.testing.assert_allclose(hit.t, 0.5, rtol=1e-4)
-        np.testing.assert_allclose(np.array(hit.prim_uv), np.repeat(weights[1:, None], len(faces), 1),
-                                   atol=1e-3)
+        np.testing.assert_allclose(
+            np.array(hit.prim_uv), np.repeat(weights[1:, None], len(faces), 1), atol=1e-3
+        )

@@ -57,9 +57,17 @@ def test_the_doctor_returns_the_exit_code(monkeypatch, capsys):
     assert capsys.readouterr().err == "there is none: install one\n"
 
 
-@pytest.mark.parametrize(("started", "ours"), [
-    ("/usr/bin/gshell-fit", True), ("gshell-report.exe", True),
-    ("gshell-mine.py", False), ("/usr/bin/my-gshell-fit", False), ("/gshell-fit/run", False), ("", False)])
+@pytest.mark.parametrize(
+    ("started", "ours"),
+    [
+        ("/usr/bin/gshell-fit", True),
+        ("gshell-report.exe", True),
+        ("gshell-mine.py", False),
+        ("/usr/bin/my-gshell-fit", False),
+        ("/gshell-fit/run", False),
+        ("", False),
+    ],
+)
 def test_ctrl_c_ends_them_quietly_from_their_start_on(started, ours, monkeypatch):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

@@ -14,8 +14,9 @@ CELL = 0.1
 
 def views(*origins) -> PinholeViews:
     look = [mi.ScalarTransform4f().look_at(list(origin), [0, 0, 0], [0, 1, 0.1]) for origin in origins]
-    return PinholeViews.from_sensors([mi.load_dict({"type": "perspective", "fov": 60, "to_world": to_world})
-                                      for to_world in look])
+    return PinholeViews.from_sensors(
+        [mi.load_dict({"type": "perspective", "fov": 60, "to_world": to_world}) for to_world in look]
+    )
 
 
 AROUND = [(4, 0, 0), (-4, 0, 0), (0, 4, 0), (0, -4, 0), (0, 0, 4), (0, 0, -4)]
@@ -92,8 +93,14 @@ def _plates(gap: float, thickness: float) -> float:
 def test_unobserved_area():
     """One view from far above sees the upper half of a sphere; the lower half is around (0, -1/2, 0)."""
     ball = arrays(trimesh.creation.icosphere(4))
-    sensor = mi.load_dict({"type": "perspective", "fov": 3, "far_clip": 1e4,
-                           "to_world": mi.ScalarTransform4f().look_at([0, 100, 0], [0, 0, 0], [0, 0, 1])})
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": 3,
+            "far_clip": 1e4,
+            "to_world": mi.ScalarTransform4f().look_at([0, 100, 0], [0, 0, 0], [0, 0, 1]),
+        }
+    )
     found = diagnose(ball, ball, PinholeViews.from_sensors([sensor]), CELL)
     assert found.unobserved == pytest.approx(0.5, abs=0.06)
     np.testing.assert_allclose(found.unobserved_center, [0, -0.5, 0], atol=0.06)
@@ -102,8 +109,13 @@ def test_unobserved_area():
 
 def test_views_that_look_elsewhere():
     ball = arrays(trimesh.creation.icosphere(2))
-    sensor = mi.load_dict({"type": "perspective", "fov": 20,
-                           "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 10], [0, 1, 0])})
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": 20,
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 10], [0, 1, 0]),
+        }
+    )
     assert diagnose(ball, ball, PinholeViews.from_sensors([sensor]), CELL).unobserved == pytest.approx(1)
 
 

@@ -45,8 +45,10 @@ def test_missing_llvm_is_one_sentence_and_exit_code_2(tmp_path):
 
 
 def test_missing_llvm_stops_ensure_variant(tmp_path):
-    code = ("from gshell_mi.doctor import ensure_variant\nfrom gshell_mi import UserError\n"
-            "try:\n    ensure_variant('llvm_ad_rgb')\nexcept UserError as e:\n    print('told:', e)")
+    code = (
+        "from gshell_mi.doctor import ensure_variant\nfrom gshell_mi import UserError\n"
+        "try:\n    ensure_variant('llvm_ad_rgb')\nexcept UserError as e:\n    print('told:', e)"
+    )
     env = os.environ | {"DRJIT_LIBLLVM_PATH": str(tmp_path / "libLLVM.so")}
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
     assert "told: DRJIT_LIBLLVM_PATH is set to" in result.stdout
@@ -69,12 +71,15 @@ def test_old_llvm_is_refused_before_it_aborts(monkeypatch):
         ensure_variant("llvm_ad_rgb")
 
 
-@pytest.mark.parametrize(("answer", "problem"), [
-    ("import sys; sys.exit('LLVM ERROR: no luck')", r"render failed \(LLVM ERROR: no luck\): install"),
-    ("1 / 0", r"failed \(ZeroDivisionError: division by zero\): `python"),
-    ("import os; os.kill(os.getpid(), 9)", r"failed \(exit code -9\)"),
-    ("print('{\"value\": 0.3, \"seconds\": 1}')", "rendered 0.300 where 0.5 is right"),
-])
+@pytest.mark.parametrize(
+    ("answer", "problem"),
+    [
+        ("import sys; sys.exit('LLVM ERROR: no luck')", r"render failed \(LLVM ERROR: no luck\): install"),
+        ("1 / 0", r"failed \(ZeroDivisionError: division by zero\): `python"),
+        ("import os; os.kill(os.getpid(), 9)", r"failed \(exit code -9\)"),
+        ('print(\'{"value": 0.3, "seconds": 1}\')', "rendered 0.300 where 0.5 is right"),
+    ],
+)
 def test_a_failing_self_test_is_told(monkeypatch, answer, problem):
     true_run = subprocess.run
     monkeypatch.setattr(subprocess, "run", lambda cmd, **kw: true_run([sys.executable, "-c", answer], **kw))
@@ -113,6 +118,16 @@ print(mi.load_dict({{"type": "envmap", "filename": {str(image)!r}}}))
 def test_report(capsys):
     assert doctor.main([]) == 0
     report = capsys.readouterr().out
-    for word in ("Python", "mitsuba", "drjit", "variants", "LLVM", "threads", "memory", "GPU", "self-test",
-                 "passed"):
+    for word in (
+        "Python",
+        "mitsuba",
+        "drjit",
+        "variants",
+        "LLVM",
+        "threads",
+        "memory",
+        "GPU",
+        "self-test",
+        "passed",
+    ):
         assert word in report

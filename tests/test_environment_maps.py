@@ -26,8 +26,9 @@ def test_values_come_back(tmp_path):
     mi.Bitmap(radiance).write(str(tmp_path / "a.exr"))
     np.testing.assert_array_equal(read_environment_map(tmp_path / "a.exr", "Map"), radiance)
     mi.Bitmap(radiance[..., :1]).write(str(tmp_path / "grey.exr"))
-    np.testing.assert_array_equal(read_environment_map(tmp_path / "grey.exr", "Map"),
-                                  np.repeat(radiance[..., :1], 3, axis=-1))
+    np.testing.assert_array_equal(
+        read_environment_map(tmp_path / "grey.exr", "Map"), np.repeat(radiance[..., :1], 3, axis=-1)
+    )
     assert environment_emitter(tmp_path / "a.exr", "Map").is_environment()
 
 
@@ -42,14 +43,22 @@ def test_light_of_a_relit_fit(spoilt, tmp_path):
 def test_light_of_a_scene(spoilt, tmp_path):
     scene = write_scene(tmp_path / "scene")
     text = scene.read_text(encoding="utf-8")
-    scene.write_text(text.replace('<emitter type="constant" id="light"/>',
-                                  f'<emitter type="envmap" id="light"> <string name="filename" '
-                                  f'value="{spoilt}"/> </emitter>'), encoding="utf-8")
+    scene.write_text(
+        text.replace(
+            '<emitter type="constant" id="light"/>',
+            f'<emitter type="envmap" id="light"> <string name="filename" value="{spoilt}"/> </emitter>',
+        ),
+        encoding="utf-8",
+    )
     with pytest.raises(UserError, match=r"column 5, row 3"):
         load_fit_scene(scene)
-    scene.write_text(text.replace('<emitter type="constant" id="light"/>',
-                                  '<emitter type="constant" id="light"> <rgb name="radiance" value="nan"/> '
-                                  '</emitter>'), encoding="utf-8")
+    scene.write_text(
+        text.replace(
+            '<emitter type="constant" id="light"/>',
+            '<emitter type="constant" id="light"> <rgb name="radiance" value="nan"/> </emitter>',
+        ),
+        encoding="utf-8",
+    )
     with pytest.raises(UserError):
         load_fit_scene(scene)
 

@@ -114,11 +114,22 @@ def test_a_thread_takes_its_lock_again_and_another_does_not(tmp_path):
     assert told[1] == "got it"
 
 
-@pytest.mark.parametrize(("name", "trouble"), [
-    ("view_000", None), ("Möbel, 2. Versuch", None), (".hidden", None), ("", "is no name"),
-    ("a\0b", "printed"),
-    ("a\nb", "printed"), ("a\udc80", "printed"), ("x" * 201, "longer"), ("..", "is no name"), ("a/b", "'/'"),
-    ("$spp", "Mitsuba takes for a parameter")])
+@pytest.mark.parametrize(
+    ("name", "trouble"),
+    [
+        ("view_000", None),
+        ("Möbel, 2. Versuch", None),
+        (".hidden", None),
+        ("", "is no name"),
+        ("a\0b", "printed"),
+        ("a\nb", "printed"),
+        ("a\udc80", "printed"),
+        ("x" * 201, "longer"),
+        ("..", "is no name"),
+        ("a/b", "'/'"),
+        ("$spp", "Mitsuba takes for a parameter"),
+    ],
+)
 def test_names(name, trouble):
     found = name_trouble(name)
     assert found is None if trouble is None else trouble in found

@@ -54,12 +54,15 @@ def test_a_window_beside_the_picture_is_refused(tmp_path):
         read_float_image(path)
 
 
-@pytest.mark.parametrize("layers, picture", [
-    ({"": "RGBA", "img": "RGBA"}, ""),
-    ({"ViewLayer.Combined": "RGBA", "ViewLayer.Depth": "Z"}, "ViewLayer.Combined"),
-    ({"ViewLayer.DiffCol": "RGB", "ViewLayer.Combined": "RGBA"}, "ViewLayer.Combined"),
-    ({"main": "rgb", "depth": "Z", "normal": "XYZ"}, "main"),
-])
+@pytest.mark.parametrize(
+    "layers, picture",
+    [
+        ({"": "RGBA", "img": "RGBA"}, ""),
+        ({"ViewLayer.Combined": "RGBA", "ViewLayer.Depth": "Z"}, "ViewLayer.Combined"),
+        ({"ViewLayer.DiffCol": "RGB", "ViewLayer.Combined": "RGBA"}, "ViewLayer.Combined"),
+        ({"main": "rgb", "depth": "Z", "normal": "XYZ"}, "main"),
+    ],
+)
 def test_the_layer_with_the_picture(layers, picture, tmp_path):
     names = [f"{layer}.{channel}".strip(".") for layer, own in layers.items() for channel in own]
     values = np.random.default_rng(1).random((30, 40, len(names))).astype(np.float32)
@@ -69,11 +72,17 @@ def test_the_layer_with_the_picture(layers, picture, tmp_path):
     assert kinds == layers[picture].upper()
 
 
-@pytest.mark.parametrize("names, words", [
-    (["a.R", "a.G", "a.B", "b.R", "b.G", "b.B"], "several layers with colours .its channels are a.B, a.G"),
-    (["depth.V", "n.X"], "no layer with R, G and B"),
-    (["Y", "RY", "BY"], "luminance and chroma"),
-])
+@pytest.mark.parametrize(
+    "names, words",
+    [
+        (
+            ["a.R", "a.G", "a.B", "b.R", "b.G", "b.B"],
+            "several layers with colours .its channels are a.B, a.G",
+        ),
+        (["depth.V", "n.X"], "no layer with R, G and B"),
+        (["Y", "RY", "BY"], "luminance and chroma"),
+    ],
+)
 def test_layers_that_say_nothing_are_named(names, words, tmp_path):
     with pytest.raises(ValueError, match=words):
         read_float_image(write(tmp_path / "a.exr", np.ones((30, 40, len(names)), np.float32), names))
@@ -105,15 +114,17 @@ def test_rows_that_say_to_be_others_or_longer(compression, tmp_path):
     """Mitsuba's reader ends the process at these, now and then."""
     path = tmp_path / "a.exr"
     pixels = np.tile(np.linspace(0, 1, 300, dtype=np.float32)[:, None], (1, 8))
-    with OpenEXR.File({"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"),
-                       "type": OpenEXR.scanlineimage}, {"Y": pixels}) as file:
+    with OpenEXR.File(
+        {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": OpenEXR.scanlineimage},
+        {"Y": pixels},
+    ) as file:
         file.write(str(path))
     np.testing.assert_allclose(read_float_image(path)[0][..., 0], pixels, atol=0.01)
     data = bytearray(path.read_bytes())
     offsets = np.frombuffer(bytes(data), "<u8", 2, _end_of_header(data))
-    for place in (0, 4):    # the row, and how many bytes follow
+    for place in (0, 4):  # the row, and how many bytes follow
         damaged = bytearray(data)
-        damaged[offsets[1] + place:offsets[1] + place + 4] = (77_777_777).to_bytes(4, "little")
+        damaged[offsets[1] + place : offsets[1] + place + 4] = (77_777_777).to_bytes(4, "little")
         path.write_bytes(damaged)
         with pytest.raises((ValueError, OSError, RuntimeError)):
             read_float_image(path)
@@ -123,7 +134,7 @@ def _end_of_header(data: bytes) -> int:
     at = 8
     while data[at]:
         at = data.index(0, data.index(0, at) + 1) + 1
-        at += 4 + int.from_bytes(data[at:at + 4], "little")
+        at += 4 + int.from_bytes(data[at : at + 4], "little")
     return at + 1
 
 

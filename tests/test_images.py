@@ -18,9 +18,10 @@ from gshell_mi.images import (
 )
 
 
-@pytest.mark.parametrize(("linear", "encoded"), [
-    (0, 0), (1, 1), (0.0031308, 0.0404499), (0.18, 0.4613561), (0.5, 0.7353570), (-1, 0), (7, 1),
-])
+@pytest.mark.parametrize(
+    ("linear", "encoded"),
+    [(0, 0), (1, 1), (0.0031308, 0.0404499), (0.18, 0.4613561), (0.5, 0.7353570), (-1, 0), (7, 1)],
+)
 def test_srgb(linear, encoded):
     assert srgb(np.array(linear)) == pytest.approx(encoded, abs=2e-6)
 

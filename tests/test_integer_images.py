@@ -13,7 +13,7 @@ VALUES = np.random.default_rng(0).integers(0, 256, (4, 6, 4), np.uint8)
 
 @pytest.mark.parametrize("mode, channels", [("L", "Y"), ("LA", "YA"), ("RGB", "RGB"), ("RGBA", "RGBA")])
 def test_eight_bits_become_linear(mode, channels, tmp_path):
-    values = np.squeeze(VALUES[..., :len(channels)], axis=-1 if len(channels) == 1 else ())
+    values = np.squeeze(VALUES[..., : len(channels)], axis=-1 if len(channels) == 1 else ())
     Image.fromarray(values, mode).save(tmp_path / "a.png")
     found, names = read_float_image(tmp_path / "a.png")
     unit = values.reshape(4, 6, -1) / 255

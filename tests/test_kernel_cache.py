@@ -35,8 +35,11 @@ def test_what_cannot_be_written_is_named(environment, tmp_path):
 
 
 def test_commands_tell(tmp_path):
-    result = subprocess.run([sys.executable, "-m", "gshell_mi.compare", str(tmp_path / "none")], text=True,
-                            capture_output=True,
-                            env=os.environ | {"HOME": "/dev/null", "DRJIT_CACHE_DIR": ""})
+    result = subprocess.run(
+        [sys.executable, "-m", "gshell_mi.compare", str(tmp_path / "none")],
+        text=True,
+        capture_output=True,
+        env=os.environ | {"HOME": "/dev/null", "DRJIT_CACHE_DIR": ""},
+    )
     assert "warning: '/dev/null/.drjit' cannot be written" in result.stderr
     assert result.returncode == 2 and "Traceback" not in result.stderr

@@ -30,16 +30,25 @@ def test_a_fit_that_goes_on_otherwise_is_found(recipe, tmp_path):
     for folder, field, step, seconds in (("whole", 1, 1, 5.0), ("same", 1, 1, 6.0), ("other", 2, 2, 5.0)):
         place = tmp_path / folder
         place.mkdir()
-        Checkpoint(stage="done", iteration=0, config={}, arrays={"sdf": np.full(3, field, np.float32)},
-                   facts={"kept": step}).save(place / "checkpoint.npz")
+        Checkpoint(
+            stage="done",
+            iteration=0,
+            config={},
+            arrays={"sdf": np.full(3, field, np.float32)},
+            facts={"kept": step},
+        ).save(place / "checkpoint.npz")
         (place / "metrics.json").write_text(json.dumps({"psnr_training": field, "seconds": seconds}))
         line = {"stage": "joint", "iteration": step, "seconds": seconds}
         (place / "log.jsonl").write_text(json.dumps(line) + "\n")
         (place / "mesh.ply").write_bytes(bytes([step]))
     assert recipe._different("fit", tmp_path / "whole", tmp_path / "same") == []
     assert set(recipe._different("fit", tmp_path / "whole", tmp_path / "other")) == {
-        "mesh.ply differs", "sdf of the checkpoint differs", "facts of the checkpoint differs",
-        "psnr_training of the metrics differs", "log.jsonl differs"}
+        "mesh.ply differs",
+        "sdf of the checkpoint differs",
+        "facts of the checkpoint differs",
+        "psnr_training of the metrics differs",
+        "log.jsonl differs",
+    }
 
 
 def test_what_is_wrong_is_found(recipe, tmp_path, monkeypatch):

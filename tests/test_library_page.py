@@ -14,9 +14,15 @@ from gshell_mi.fit import FitConfig
 PAGE = Path(__file__).parents[1] / "docs" / "library.md"
 
 #: What makes the examples quick; each has to be there.
-SMALLER = {"TetLattice(64)": "TetLattice(24)", "TetLattice(48)": "TetLattice(16)", "spp=64": "spp=8",
-           '"width": 96, "height": 96': '"width": 32, "height": 32', ":48]": ":16]",
-           '"resolution": 32': '"resolution": 12', "range(100)": "range(8)"}
+SMALLER = {
+    "TetLattice(64)": "TetLattice(24)",
+    "TetLattice(48)": "TetLattice(16)",
+    "spp=64": "spp=8",
+    '"width": 96, "height": 96': '"width": 32, "height": 32',
+    ":48]": ":16]",
+    '"resolution": 32': '"resolution": 12',
+    "range(100)": "range(8)",
+}
 
 
 def short_config() -> FitConfig:
@@ -70,9 +76,11 @@ def test_fields_of_the_mesh_are_open(done):
 def test_fit_example(bowl_scene, tmp_path, variant):
     names = {"config": short_config()}
     code = example(5, variant)
-    for said, here in {'"scenes/tshirt.xml"': repr(str(bowl_scene)),
-                       '"out/tshirt"': repr(str(tmp_path / "out")),
-                       "config=FitConfig()": "config=config, report=False"}.items():
+    for said, here in {
+        '"scenes/tshirt.xml"': repr(str(bowl_scene)),
+        '"out/tshirt"': repr(str(tmp_path / "out")),
+        "config=FitConfig()": "config=config, report=False",
+    }.items():
         assert said in code
         code = code.replace(said, here)
     exec(compile(code, str(PAGE), "exec"), names)

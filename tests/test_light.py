@@ -62,8 +62,14 @@ def test_the_emitter_shines_like_a_stock_one(radiance, stock):
 
 def test_from_an_emitter(radiance, stock):
     """A rotated and scaled map starts as it is; a constant says nothing of the light."""
-    rotated = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(radiance), "scale": 2.0,
-                            "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 70)})
+    rotated = mi.load_dict(
+        {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(radiance),
+            "scale": 2.0,
+            "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 70),
+        }
+    )
     light = EnvironmentLight.from_emitter(rotated, height=6)
     np.testing.assert_allclose(np.array(light.radiance), 2 * radiance, rtol=1e-5)
     np.testing.assert_allclose(np.array(look(light.emitter())), np.array(look(rotated)), rtol=1e-4)

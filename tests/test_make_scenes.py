@@ -204,6 +204,12 @@ def test_command(tmp_path):
     result = subprocess.run([*command, "leaf", "-o", str(tmp_path)], capture_output=True, text=True)
     assert result.returncode == 0 and result.stdout.startswith("leaf: ")
     assert {p.name for p in tmp_path.rglob("*") if p.is_file()} == {
-        "leaf.xml", "sensors.xml", "test.xml", "reference.xml", "truth.ply", "light.exr"}
+        "leaf.xml",
+        "sensors.xml",
+        "test.xml",
+        "reference.xml",
+        "truth.ply",
+        "light.exr",
+    }
     result = subprocess.run([*command, "teapot"], capture_output=True, text=True)
     assert result.returncode == 2 and "no such object: teapot; there are basket" in result.stderr

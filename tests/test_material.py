@@ -76,8 +76,12 @@ def test_one_colour_for_all():
 
 @pytest.mark.parametrize("twosided", [False, True])
 def test_material_given_by_a_scene(twosided):
-    bsdf = {"type": "principled", "base_color": {"type": "rgb", "value": [0.2, 0.4, 0.6]}, "roughness": 0.3,
-            "metallic": 0.7}
+    bsdf = {
+        "type": "principled",
+        "base_color": {"type": "rgb", "value": [0.2, 0.4, 0.6]},
+        "roughness": 0.3,
+        "metallic": 0.7,
+    }
     given = given_material(mi.load_dict({"type": "twosided", "bsdf": bsdf} if twosided else bsdf))
     np.testing.assert_allclose(given.pop("base_color"), [0.2, 0.4, 0.6], atol=1e-6)
     assert given == pytest.approx({"roughness": 0.3, "metallic": 0.7})

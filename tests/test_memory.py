@@ -24,8 +24,10 @@ def system(tmp_path, monkeypatch):
 
 
 def limit(folder: Path, most: int | str, used: int, cached: int, version: int = 2) -> None:
-    names = {1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
-             2: ("memory.max", "memory.current", "inactive_file")}[version]
+    names = {
+        1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+        2: ("memory.max", "memory.current", "inactive_file"),
+    }[version]
     folder.mkdir(parents=True, exist_ok=True)
     (folder / names[0]).write_text(f"{most}\n")
     (folder / names[1]).write_text(f"{used}\n")

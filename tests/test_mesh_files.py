@@ -23,11 +23,17 @@ def test_unused_vertices_are_dropped():
     np.testing.assert_array_equal(faces, FACES)
 
 
-@pytest.mark.parametrize("vertices, faces, words", [
-    (SQUARE, [[0, 1, 4]], "vertices that it lacks"), (SQUARE, [[0, 1, -1]], "vertices that it lacks"),
-    (np.where(SQUARE == 1, np.inf, 0), FACES, "NaN or infinity"), (0 * SQUARE, FACES, "with an area"),
-    (1e30 * SQUARE, FACES, "too far away"), (SQUARE[:, :2], FACES, "three coordinates"),
-])
+@pytest.mark.parametrize(
+    "vertices, faces, words",
+    [
+        (SQUARE, [[0, 1, 4]], "vertices that it lacks"),
+        (SQUARE, [[0, 1, -1]], "vertices that it lacks"),
+        (np.where(SQUARE == 1, np.inf, 0), FACES, "NaN or infinity"),
+        (0 * SQUARE, FACES, "with an area"),
+        (1e30 * SQUARE, FACES, "too far away"),
+        (SQUARE[:, :2], FACES, "three coordinates"),
+    ],
+)
 def test_what_is_refused(vertices, faces, words):
     with pytest.raises(ValueError, match=words):
         check_triangles(np.asarray(vertices, float), np.asarray(faces))

@@ -12,8 +12,11 @@ def write(folder, **texts):
 
 
 def contents(folder) -> dict[str, str]:
-    return {path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*")
-            if path.is_file() and path.name != MARK}
+    return {
+        path.relative_to(folder).as_posix(): path.read_text()
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != MARK
+    }
 
 
 @pytest.fixture
@@ -74,8 +77,21 @@ def test_removing_leaves_what_is_not_ours(own):
     assert not own.path.exists()
 
 
-@pytest.mark.parametrize("name", ["../a.exr", "/etc/view_000.exr", "test/../view_000.exr", "notes.txt", "",
-                                  "view_000.exr/", "./view_000.exr", "test/a/test_0.exr", 5, None])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../a.exr",
+        "/etc/view_000.exr",
+        "test/../view_000.exr",
+        "notes.txt",
+        "",
+        "view_000.exr/",
+        "./view_000.exr",
+        "test/a/test_0.exr",
+        5,
+        None,
+    ],
+)
 def test_a_mark_is_believed_in_names_of_its_kind_alone(own, name):
     mark = json.loads((own.path / MARK).read_text())
     (own.path / MARK).write_text(json.dumps(mark | {"files": [name]}))
@@ -85,7 +101,7 @@ def test_a_mark_is_believed_in_names_of_its_kind_alone(own, name):
 def test_another_kind(own):
     with pytest.raises(UserError, match=r"was written by gshell_mi.capture; choose another place"):
         OwnFolder(own.path, "fit").claim("mesh.ply")
-    with (pytest.raises(UserError, match=r"was written by gshell_mi.capture"), own_folder(own.path, "fit")):
+    with pytest.raises(UserError, match=r"was written by gshell_mi.capture"), own_folder(own.path, "fit"):
         pass
 
 
@@ -98,8 +114,10 @@ def test_inputs_under_any_name(own, tmp_path):
 
 
 def test_errors_of_the_disk_become_sentences(own):
-    with (pytest.raises(UserError, match=r"'.*a.exr' cannot be read or written \(No space left on device\)"),
-          own_folder(own.path, "capture")):
+    with (
+        pytest.raises(UserError, match=r"'.*a.exr' cannot be read or written \(No space left on device\)"),
+        own_folder(own.path, "capture"),
+    ):
         raise OSError(28, "No space left on device", "a.exr")
     with pytest.raises(UserError, match="is no folder"), own_folder(own.path / "none", "capture"):
         pass

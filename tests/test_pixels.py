@@ -13,9 +13,14 @@ SIZES = (64, 48), (80, 60)
 
 
 def views() -> PinholeViews:
-    return PinholeViews.from_sensors([
-        mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": width, "height": height}})
-        for width, height in SIZES])
+    return PinholeViews.from_sensors(
+        [
+            mi.load_dict(
+                {"type": "perspective", "film": {"type": "hdrfilm", "width": width, "height": height}}
+            )
+            for width, height in SIZES
+        ]
+    )
 
 
 def ring(width: int, height: int) -> Target:
@@ -60,7 +65,7 @@ def test_what_is_unknown_is_not_drawn():
     targets = []
     for width, height in SIZES:
         known = np.ones((height, width), np.float32)
-        known[:, :width // 2] = 0
+        known[:, : width // 2] = 0
         targets.append(Target(None, ring(width, height).rgba, True, known=known))
     sample = PixelPool(views(), targets).sample(1 << 14, seed=3, step=5)
     assert sample.film.numpy()[0].min() >= 0.5

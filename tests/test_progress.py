@@ -38,9 +38,11 @@ def test_without_a_terminal_a_stage_says_where_it_is(monkeypatch: pytest.MonkeyP
             now[0] += 1.0
             advance({"loss": 0.5, "psnr": 20.0})
     lines = capfd.readouterr().err.splitlines()
-    assert lines == ["joint: loss 0.5000  PSNR 20.0 dB  1/100",
-                     "joint: loss 0.5000  PSNR 20.0 dB  31/100  1.00 s/step  1:09 left",
-                     "joint: took 50.0 s"]
+    assert lines == [
+        "joint: loss 0.5000  PSNR 20.0 dB  1/100",
+        "joint: loss 0.5000  PSNR 20.0 dB  31/100  1.00 s/step  1:09 left",
+        "joint: took 50.0 s",
+    ]
 
 
 def test_a_quiet_warning_is_one_of_python():

@@ -68,17 +68,27 @@ def test_the_path_may_be_a_string(scene):
     assert load_fit_scene(str(scene)).path == scene
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ('type="gshell" id="subject"> <integer name="resolution" value="20"/>', 'type="sphere">',
-     "has no gshell shapes; a fit needs exactly one"),
-    ("</shape>", '</shape> <shape type="gshell"/>', "has 2 gshell shapes"),
-    ('id="light"', 'id="lamp"', "no environment emitter with the id 'light'"),
-    ('type="constant" id="light"', 'type="point" id="light"', "no environment emitter with the id 'light'"),
-    ('type="constant" id="light"', 'type="sunsky" id="light"', "'light'; add .*constant.* or an envmap"),
-    ('"view_007"', '"view_002"', "view_002"),
-    ('type="constant"', 'type="unheard_of"', "cannot be loaded by Mitsuba: .*unheard_of"),
-    ("</scene>", "", "cannot be loaded by Mitsuba"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            'type="gshell" id="subject"> <integer name="resolution" value="20"/>',
+            'type="sphere">',
+            "has no gshell shapes; a fit needs exactly one",
+        ),
+        ("</shape>", '</shape> <shape type="gshell"/>', "has 2 gshell shapes"),
+        ('id="light"', 'id="lamp"', "no environment emitter with the id 'light'"),
+        (
+            'type="constant" id="light"',
+            'type="point" id="light"',
+            "no environment emitter with the id 'light'",
+        ),
+        ('type="constant" id="light"', 'type="sunsky" id="light"', "'light'; add .*constant.* or an envmap"),
+        ('"view_007"', '"view_002"', "view_002"),
+        ('type="constant"', 'type="unheard_of"', "cannot be loaded by Mitsuba: .*unheard_of"),
+        ("</scene>", "", "cannot be loaded by Mitsuba"),
+    ],
+)
 def test_what_it_refuses(scene, old, new, message):
     change(scene, old, new)
     with pytest.raises(UserError, match=message) as told:
@@ -96,12 +106,16 @@ def test_other_shapes_and_lights_may_be_there(scene):
 def test_a_mesh_twice_at_one_place_is_told(scene):
     """Of different materials, as Mitsuba makes one mesh of those of equal ones."""
     assert load_fit_scene(scene).notes == []
-    cubes = "".join(f'<shape type="cube" id="{name}"> <bsdf type="diffuse"> <rgb name="reflectance" '
-                    f'value="{value}"/> </bsdf> </shape>' for name, value in (("a", 0.2), ("b", 0.7)))
+    cubes = "".join(
+        f'<shape type="cube" id="{name}"> <bsdf type="diffuse"> <rgb name="reflectance" '
+        f'value="{value}"/> </bsdf> </shape>'
+        for name, value in (("a", 0.2), ("b", 0.7))
+    )
     change(scene, "</scene>", cubes + "</scene>")
     (note,) = load_fit_scene(scene).notes
-    assert note.partition(": ")[0] in {f"Mesh '{a}' has 12 faces that lie in faces of mesh '{b}'"
-                                       for a, b in ("ab", "ba")}
+    assert note.partition(": ")[0] in {
+        f"Mesh '{a}' has 12 faces that lie in faces of mesh '{b}'" for a, b in ("ab", "ba")
+    }
 
 
 def test_targets_that_nowhere_reach_full_coverage_are_told(scene):
@@ -138,7 +152,9 @@ def test_renders_only_what_is_missing(referenced):
     assert (folder / "view_003.exr").read_bytes() == before
     np.testing.assert_array_equal(fit.targets[3].rgba, mine)
     assert {path.name for path in folder.iterdir()} == {f"{name}.exr" for name in IDS} | {
-        "reference.xml", "truth.ply"}
+        "reference.xml",
+        "truth.ply",
+    }
     for target in fit.targets[:3] + fit.targets[4:]:
         assert target.has_alpha
         assert mi.Bitmap(str(target.path)).component_format() == mi.Struct.Type.Float16

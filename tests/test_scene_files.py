@@ -38,8 +38,10 @@ def planted(tmp_path):
     (tmp_path / "plugins").mkdir()
     (tmp_path / "code.c").write_text(CODE)
     mark, library = tmp_path / "loaded", tmp_path / "plugins" / "evil.so"
-    subprocess.run([compiler, "-shared", "-fPIC", f'-DMARK="{mark}"', str(tmp_path / "code.c"), "-o",
-                    str(library)], check=True)
+    subprocess.run(
+        [compiler, "-shared", "-fPIC", f'-DMARK="{mark}"', str(tmp_path / "code.c"), "-o", str(library)],
+        check=True,
+    )
     for name in ("perspective", "hdrfilm", "independent", "gaussian", "path", "prb", "gshell", "cylinder"):
         shutil.copy(library, library.with_name(f"{name}.so"))
     return tmp_path, mark
@@ -47,10 +49,21 @@ def planted(tmp_path):
 
 def run(folder, *lines):
     """In a process of its own, as plugins are loaded once; from the folder, which is searched as well."""
-    program = "\n".join(["import gshell_mi, mitsuba as mi", "mi.set_variant('llvm_ad_rgb')",
-                         "from gshell_mi.scene_files import load_scene", *lines])
-    return subprocess.run([sys.executable, "-c", program], cwd=folder, capture_output=True, text=True,
-                          env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])})
+    program = "\n".join(
+        [
+            "import gshell_mi, mitsuba as mi",
+            "mi.set_variant('llvm_ad_rgb')",
+            "from gshell_mi.scene_files import load_scene",
+            *lines,
+        ]
+    )
+    return subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+    )
 
 
 def test_plugins_beside_a_scene_are_never_loaded(planted):
@@ -60,14 +73,17 @@ def test_plugins_beside_a_scene_are_never_loaded(planted):
     assert (found.stdout.strip(), mark.exists()) == ("1", False), found.stderr
 
 
-@pytest.mark.parametrize("content", [
-    '<shape type="evil"/>',
-    '<default name="kind" value="evil"/><shape type="$kind"/>',
-    '<path value="{folder}"/><shape type="evil"/>',
-    '<shape type="../plugins/evil"/>',
-    '<include filename="inner.xml"/>',
-    '<bsdf type="twosided"><bsdf type="evil"/></bsdf>',
-])
+@pytest.mark.parametrize(
+    "content",
+    [
+        '<shape type="evil"/>',
+        '<default name="kind" value="evil"/><shape type="$kind"/>',
+        '<path value="{folder}"/><shape type="evil"/>',
+        '<shape type="../plugins/evil"/>',
+        '<include filename="inner.xml"/>',
+        '<bsdf type="twosided"><bsdf type="evil"/></bsdf>',
+    ],
+)
 def test_types_that_nobody_knows_are_refused_before_anything_is_loaded(content, planted):
     folder, mark = planted
     scene(folder, '<emitter type="evil"/>', "inner.xml")
@@ -98,38 +114,55 @@ def test_files_beside_the_scene_are_found(tmp_path):
     (tmp_path / "inside").mkdir()
     trimesh.creation.icosphere(1).export(tmp_path / "inside" / "ball.ply")
     scene(tmp_path, SENSOR, "sensors.xml")
-    path = scene(tmp_path, '<include filename="sensors.xml"/><shape type="ply">'
-                           '<string name="filename" value="inside/ball.ply"/></shape>')
+    path = scene(
+        tmp_path,
+        '<include filename="sensors.xml"/><shape type="ply">'
+        '<string name="filename" value="inside/ball.ply"/></shape>',
+    )
     loaded = load_scene(path)
     assert (loaded.sensors()[0].id(), loaded.shapes()[0].face_count()) == ("view", 80)
 
 
 def test_an_image_that_would_crash_mitsuba_is_refused(tmp_path):
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage,
-                  "displayWindow": ((0, 0), (31, 15)), "dataWindow": ((-2, -2), (31, 15))},
-                 {name: np.ones((18, 34), np.float32) for name in "RGB"}).write(str(tmp_path / "light.exr"))
+    OpenEXR.File(
+        {
+            "compression": OpenEXR.ZIP_COMPRESSION,
+            "type": OpenEXR.scanlineimage,
+            "displayWindow": ((0, 0), (31, 15)),
+            "dataWindow": ((-2, -2), (31, 15)),
+        },
+        {name: np.ones((18, 34), np.float32) for name in "RGB"},
+    ).write(str(tmp_path / "light.exr"))
     path = scene(tmp_path, '<emitter type="envmap"><string name="filename" value="light.exr"/></emitter>')
     with pytest.raises(UserError, match=r"light.exr' has a data window other than its display window"):
         load_scene(path)
 
 
 #: A row that is not packed behind one that is: Mitsuba writes past the end of its memory.
-_OVERFLOWING = (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n\2\2\0\10" + b"\x88\x80" * 4
-                + b"\x90\x10" * 40)
+_OVERFLOWING = (
+    b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n\2\2\0\10" + b"\x88\x80" * 4 + b"\x90\x10" * 40
+)
 
 
-@pytest.mark.parametrize("around", [
-    '<emitter type="envmap">{}</emitter>',
-    '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{}</texture></bsdf>',
-])
-@pytest.mark.parametrize("name, content", [
-    ("a.hdr", _OVERFLOWING), ("a.png", _OVERFLOWING),
-    ("a.pfm", b"PF\n65536 65536\n-1.0\n" + bytes(48)),
-    ("a.ppm", b"P6\n65536 65536\n255\n" + bytes(48)),
-    ("a.bmp", b"BM" + bytes(8) + b"\x36\0\0\0\x28\0\0\0\x10\0\0\0\0\0\0\x80\1\0\x18\0" + bytes(40)),
-    # Behind a header of no size comes what makes Mitsuba take it for TGA.
-    ("a.tga", bytes((0, 0, 2)) + bytes(13) + bytes((24, 0)) + bytes(16) + b"TRUEVISION-XFILE.\0"),
-])
+@pytest.mark.parametrize(
+    "around",
+    [
+        '<emitter type="envmap">{}</emitter>',
+        '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{}</texture></bsdf>',
+    ],
+)
+@pytest.mark.parametrize(
+    "name, content",
+    [
+        ("a.hdr", _OVERFLOWING),
+        ("a.png", _OVERFLOWING),
+        ("a.pfm", b"PF\n65536 65536\n-1.0\n" + bytes(48)),
+        ("a.ppm", b"P6\n65536 65536\n255\n" + bytes(48)),
+        ("a.bmp", b"BM" + bytes(8) + b"\x36\0\0\0\x28\0\0\0\x10\0\0\0\0\0\0\x80\1\0\x18\0" + bytes(40)),
+        # Behind a header of no size comes what makes Mitsuba take it for TGA.
+        ("a.tga", bytes((0, 0, 2)) + bytes(13) + bytes((24, 0)) + bytes(16) + b"TRUEVISION-XFILE.\0"),
+    ],
+)
 def test_images_that_would_crash_mitsuba_are_refused(around, name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     path = scene(tmp_path, SENSOR + around.format(f'<string name="filename" value="{name}"/>'))
@@ -143,17 +176,24 @@ def test_images_of_other_kinds_are_textures(tmp_path):
         Image.fromarray(colors).save(tmp_path / name)
     mi.Bitmap(colors.astype(np.float32)).write(str(tmp_path / "a.hdr"))
     mi.Bitmap(colors.astype(np.float32)).write(str(tmp_path / "a.pfm"))
-    textures = "".join(f'<bsdf type="diffuse" id="{path.suffix[1:]}"> <texture type="bitmap" '
-                       f'name="reflectance"> <string name="filename" value="{path.name}"/> </texture> </bsdf>'
-                       for path in sorted(tmp_path.glob("a.*")))
+    textures = "".join(
+        f'<bsdf type="diffuse" id="{path.suffix[1:]}"> <texture type="bitmap" '
+        f'name="reflectance"> <string name="filename" value="{path.name}"/> </texture> </bsdf>'
+        for path in sorted(tmp_path.glob("a.*"))
+    )
     assert textures.count("<texture") == 6
     assert load_scene(scene(tmp_path, SENSOR + textures)).sensors()
 
 
-@pytest.mark.parametrize("content, words", [
-    ("<scene", "is no XML file"), ("", "is no XML file"), ('<shape type="sphere"/>', "correct it"),
-    ('<scene version="3.0.0"><shape type="sphere"></scene>', "mismatched tag"),
-])
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        ("<scene", "is no XML file"),
+        ("", "is no XML file"),
+        ('<shape type="sphere"/>', "correct it"),
+        ('<scene version="3.0.0"><shape type="sphere"></scene>', "mismatched tag"),
+    ],
+)
 def test_other_files(content, words, tmp_path):
     (tmp_path / "a.xml").write_text(content, encoding="utf-8")
     with pytest.raises(UserError, match=words):

@@ -10,7 +10,7 @@ def test_includes_values_and_parameters(tmp_path):
         <default name="where" value="{tmp_path}"/> <default name="kind" value="envmap"/>
         <path value="maps"/> <include filename="in/sensors.xml"/> <string name="filename" value="sky.exr"/>
         <emitter type="$kind"> <string name="filename" value="$where/map.exr"/> </emitter>
-        <string name="missing" value="none.exr"/> <string name="long" value="{'x' * 5000}"/>
+        <string name="missing" value="none.exr"/> <string name="long" value="{"x" * 5000}"/>
         <string name="empty" value=""/>
     </scene>""")
     (tmp_path / "in" / "sensors.xml").write_text("""<scene version="3.0.0">
@@ -19,8 +19,9 @@ def test_includes_values_and_parameters(tmp_path):
     </scene>""")
     found = scene_inputs(tmp_path / "scene.xml")
     assert {file.resolve() for file in found} == {
-        tmp_path / name for name in ("scene.xml", "in/sensors.xml", "mesh.ply", "map.exr", "in/near.npz",
-                                     "maps/sky.exr")}
+        tmp_path / name
+        for name in ("scene.xml", "in/sensors.xml", "mesh.ply", "map.exr", "in/near.npz", "maps/sky.exr")
+    }
 
 
 def test_what_is_no_xml_names_nothing(tmp_path):

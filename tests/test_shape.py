@@ -405,9 +405,11 @@ def test_a_neighbour_of_equal_material_does_not_swallow_it(other, tmp_path):
     trimesh.creation.icosphere(1).export(tmp_path / "ball.ply")
     bsdf = {"type": "diffuse"}
     neighbour = {"type": other, "bsdf": bsdf} | (
-        {"filename": str(tmp_path / "ball.ply")} if other == "ply" else {"resolution": 8})
-    scene = mi.load_dict({"type": "scene", "other": neighbour,
-                          "subject": {"type": "gshell", "resolution": 16, "bsdf": bsdf}})
+        {"filename": str(tmp_path / "ball.ply")} if other == "ply" else {"resolution": 8}
+    )
+    scene = mi.load_dict(
+        {"type": "scene", "other": neighbour, "subject": {"type": "gshell", "resolution": 16, "bsdf": bsdf}}
+    )
     assert len(scene.shapes()) == 2
     params = mi.traverse(scene)
     assert "subject.sdf" in params and not any("unmerged" in key for key in params.keys())

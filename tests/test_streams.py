@@ -43,8 +43,10 @@ def test_output_that_cannot_be_written_is_told():
     with open(FULL, "w") as full:
         found = run("gshell_mi.doctor", stdout=full, stderr=subprocess.PIPE)
     assert found.returncode == 2
-    assert found.stderr == ("error: What was found cannot be printed (No space left on device), though all "
-                            "files are written; print it to another place.\n")
+    assert found.stderr == (
+        "error: What was found cannot be printed (No space left on device), though all "
+        "files are written; print it to another place.\n"
+    )
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="needs a device that is always full")
@@ -67,14 +69,17 @@ def test_errors_become_sentences(capsys):
     def raising(error):
         def work():
             raise error
+
         return work
 
     assert with_streams(lambda: 0) == 0 and with_streams(lambda: 130) == 130
     assert with_streams(raising(UserError("It is too small; enlarge it."))) == 2
     assert capsys.readouterr().err == "error: It is too small; enlarge it.\n"
     assert with_streams(raising(PermissionError(13, "Permission denied", "/root/a.xml"))) == 2
-    assert capsys.readouterr().err == ("error: '/root/a.xml' cannot be read or written (Permission denied); "
-                                       "check the path, its permissions and the free space.\n")
+    assert capsys.readouterr().err == (
+        "error: '/root/a.xml' cannot be read or written (Permission denied); "
+        "check the path, its permissions and the free space.\n"
+    )
     with pytest.raises(KeyError):
         with_streams(raising(KeyError("a fault of ours keeps its traceback")))
 
@@ -96,9 +101,13 @@ def test_a_forgiving_stream_keeps_what_happened():
 
 def interrupted(command: list[str], seconds: float) -> tuple[int, str]:
     """Exit code and stderr of a command that gets a SIGINT after so many seconds."""
-    process = subprocess.Popen([sys.executable, "-m", *command], stdout=subprocess.PIPE,
-                               stderr=subprocess.PIPE, text=True,
-                               preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+    process = subprocess.Popen(
+        [sys.executable, "-m", *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
     time.sleep(seconds)
     process.send_signal(signal.SIGINT)
     _, told = process.communicate(timeout=120)
@@ -117,8 +126,9 @@ def loading() -> float:
 def test_it_works_from_the_first_second_on(bowl_scene, tmp_path, loading, share):
     """At whatever moment: while modules load, while the scene loads, in the fit."""
     options = ["--openings.iterations", "100000", "--radiance.batch", "256"]
-    code, told = interrupted(["gshell_mi.fit", str(bowl_scene), "-o", str(tmp_path / "out"), *options],
-                             share * loading)
+    code, told = interrupted(
+        ["gshell_mi.fit", str(bowl_scene), "-o", str(tmp_path / "out"), *options], share * loading
+    )
     assert code == 130, told
     assert "Traceback" not in told and "Interrupted" in told
 

@@ -31,5 +31,8 @@ def test_no_gradient_no_step():
 @pytest.mark.parametrize("scale", [1e-6, 1e4])
 def test_the_unit_of_the_loss_does_not_matter(scale):
     gradient = np.array([0.5, -2, 1], np.float32)
-    np.testing.assert_allclose(stepped(TemperedAdam(lr=0.1, epsilon=1e-12), scale * gradient),
-                               stepped(TemperedAdam(lr=0.1), gradient), rtol=1e-3)
+    np.testing.assert_allclose(
+        stepped(TemperedAdam(lr=0.1, epsilon=1e-12), scale * gradient),
+        stepped(TemperedAdam(lr=0.1), gradient),
+        rtol=1e-3,
+    )

@@ -33,10 +33,10 @@ def test_with_one_the_phase_computes_what_it_is_given():
 def test_inner_phases_are_taken_out_of_outer_ones():
     clock = iter(range(100))
     with Stopwatch(clock=lambda: next(clock)) as watch:
-        with phase("outer"):            # begins at 0
-            with phase("inner"):        # 1 to 2
+        with phase("outer"):  # begins at 0
+            with phase("inner"):  # 1 to 2
                 pass
-            with phase("inner"):        # 3 to 4
+            with phase("inner"):  # 3 to 4
                 pass
         # ends at 5
     assert watch.seconds == {"outer": 3, "inner": 2}

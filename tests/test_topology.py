@@ -25,8 +25,15 @@ def strip(count: int, *, half_turns: int) -> tuple[np.ndarray, np.ndarray]:
 def test_sphere():
     sphere = trimesh.creation.icosphere(2)
     found = topology(sphere.vertices, sphere.faces)
-    assert found == Topology(vertices=162, faces=320, components=1, boundary_loops=0, pinholes=0,
-                             boundary_length=0.0, nonmanifold_edges=0)
+    assert found == Topology(
+        vertices=162,
+        faces=320,
+        components=1,
+        boundary_loops=0,
+        pinholes=0,
+        boundary_length=0.0,
+        nonmanifold_edges=0,
+    )
 
 
 def test_open_cylinder_has_two_loops():

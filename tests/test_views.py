@@ -9,8 +9,12 @@ from gshell_mi.views import PinholeViews
 SENSORS = {
     "plain": {"type": "perspective", "fov": 40},
     "fov along y": {"type": "perspective", "fov": 50, "fov_axis": "y"},
-    "principal point": {"type": "perspective", "fov": 35, "principal_point_offset_x": 0.1,
-                        "principal_point_offset_y": -0.2},
+    "principal point": {
+        "type": "perspective",
+        "fov": 35,
+        "principal_point_offset_x": 0.1,
+        "principal_point_offset_y": -0.2,
+    },
     "thin lens": {"type": "thinlens", "fov": 40, "aperture_radius": 0.1, "focus_distance": 3.0},
 }
 

@@ -33,9 +33,14 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return run_command("batch", "Run many commands.", _Arguments, _batch, arguments,
-                       interrupted=lambda given: f"Interrupted; run the same command again to go on with "
-                                                 f"'{given.output}'.")
+    return run_command(
+        "batch",
+        "Run many commands.",
+        _Arguments,
+        _batch,
+        arguments,
+        interrupted=lambda given: f"Interrupted; run the same command again to go on with '{given.output}'.",
+    )
 
 
 def _batch(given: _Arguments) -> None:
@@ -49,8 +54,17 @@ def _batch(given: _Arguments) -> None:
         raise UserError(f"--retries must not be negative, but is {given.retries}.")
     if given.cpus is not None and not given.cpus >= 1:
         raise UserError(f"--cpus must be at least 1, not {given.cpus:g}.")
-    print(run_batch(given.jobs, given.output, results=given.results, address=given.address,
-                    retries=given.retries, cpus=given.cpus, quiet=given.quiet))
+    print(
+        run_batch(
+            given.jobs,
+            given.output,
+            results=given.results,
+            address=given.address,
+            retries=given.retries,
+            cpus=given.cpus,
+            quiet=given.quiet,
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -24,8 +24,16 @@ from .work import finished, run_job
 _SUBMITTED = 2000
 
 
-def run_batch(path: Path, output: Path, *, results: str | None = None, address: str | None = None,
-              retries: int = 2, cpus: float | None = None, quiet: bool = True) -> str:
+def run_batch(
+    path: Path,
+    output: Path,
+    *,
+    results: str | None = None,
+    address: str | None = None,
+    retries: int = 2,
+    cpus: float | None = None,
+    quiet: bool = True,
+) -> str:
     """Runs the jobs of a file that are not done yet; returns what to tell about them.
 
     Args:
@@ -45,8 +53,10 @@ def run_batch(path: Path, output: Path, *, results: str | None = None, address: 
         import fsspec  # noqa: F401
         import ray
     except ImportError as error:
-        raise UserError(f"This needs {'fsspec' if error.name == 'fsspec' else 'Ray'}; install it with pip "
-                        f"install 'gshell_mi[ray]'.") from None
+        raise UserError(
+            f"This needs {'fsspec' if error.name == 'fsspec' else 'Ray'}; install it with pip "
+            f"install 'gshell_mi[ray]'."
+        ) from None
     output.mkdir(parents=True, exist_ok=True)
     with own_folder(output, "batch") as folder:
         folder.claim("batch.json", "results.jsonl", "results.html")
@@ -63,33 +73,53 @@ def run_batch(path: Path, output: Path, *, results: str | None = None, address: 
         _write(folder, "results.html", _page(rows))
     failed = [row for row in rows if row["status"] != "done"]
     if failed:
-        raise UserError(f"{counted(len(failed), 'job')} of {len(rows)} failed, first '{failed[0]['name']}'; "
-                        f"see '{output / 'results.html'}', and run the same command again to try them anew.")
+        raise UserError(
+            f"{counted(len(failed), 'job')} of {len(rows)} failed, first '{failed[0]['name']}'; "
+            f"see '{output / 'results.html'}', and run the same command again to try them anew."
+        )
     return f"{output}: {counted(len(rows), 'job')} done; see results.html"
 
 
-def _run_all(ray, waiting: deque[Job], done: dict[str, dict], results: str, address: str | None,
-             retries: int, cpus: float | None, quiet: bool) -> None:
+def _run_all(
+    ray,
+    waiting: deque[Job],
+    done: dict[str, dict],
+    results: str,
+    address: str | None,
+    retries: int,
+    cpus: float | None,
+    quiet: bool,
+) -> None:
     try:
         own = {} if address else {"num_cpus": cpus, "include_dashboard": False}
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
     except Exception as error:  # Ray raises whatever it stumbles over
-        raise UserError(f"There is no Ray cluster at '{address}' ({type(error).__name__}); start one with "
-                        f"ray start --head, or leave --address out.") from error
+        raise UserError(
+            f"There is no Ray cluster at '{address}' ({type(error).__name__}); start one with "
+            f"ray start --head, or leave --address out."
+        ) from error
     try:
         remote = ray.remote(max_retries=retries)(run_job)
         tries: dict[str, int] = {}
         running: dict = {}
-        columns = (TextColumn("batch"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-                   TextColumn("{task.fields[rate]}"))
+        columns = (
+            TextColumn("batch"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[rate]}"),
+        )
         started, ended = time.perf_counter(), 0
         with Bars(*columns, quiet=quiet) as progress:
             bar = progress.add_task("", total=len(waiting) + len(done), completed=len(done), rate="")
             while waiting or running:
                 while waiting and len(running) < _SUBMITTED:
                     job = waiting.popleft()
-                    needs = {"num_cpus": job.cpus, "num_gpus": job.gpus,
-                             "memory": int(job.memory_gib * 2**30) or None}
+                    needs = {
+                        "num_cpus": job.cpus,
+                        "num_gpus": job.gpus,
+                        "memory": int(job.memory_gib * 2**30) or None,
+                    }
                     running[remote.options(**needs).remote(job, results)] = job
                 check_interrupt()
                 ready, _ = ray.wait(list(running), num_returns=1, timeout=1)
@@ -113,8 +143,13 @@ def _outcome(ray, reference, job: Job) -> dict:
     try:
         return ray.get(reference)
     except ray.exceptions.RayError as error:
-        return {"name": job.name, "status": "failed", "code": None, "seconds": 0.0,
-                "told": f"its worker was lost ({type(error).__name__})"}
+        return {
+            "name": job.name,
+            "status": "failed",
+            "code": None,
+            "seconds": 0.0,
+            "told": f"its worker was lost ({type(error).__name__})",
+        }
     except Exception as error:  # what the job's function raised, as where storage cannot be written
         return {"name": job.name, "status": "failed", "code": None, "seconds": 0.0, "told": str(error)}
 
@@ -129,8 +164,12 @@ def _page(rows: list[dict]) -> str:
     body = "".join(
         f"<tr class='{row['status']}'><td>{html.escape(row['name'])}</td><td>{row['status']}</td>"
         f"<td>{row.get('psnr', '')}</td><td>{row['seconds']}</td>"
-        f"<td><pre>{html.escape(row['told'])}</pre></td></tr>\n" for row in rows)
-    return ("<!doctype html><meta charset='utf-8'><title>Results</title><style>body{font:14px sans-serif}"
-            "td,th{padding:3px 10px;text-align:left;vertical-align:top}pre{margin:0;white-space:pre-wrap}"
-            ".wrong,.failed{background:#fdd}</style><table><tr><th>job</th><th>status</th><th>PSNR (dB)</th>"
-            f"<th>seconds</th><th></th></tr>\n{body}</table>\n")
+        f"<td><pre>{html.escape(row['told'])}</pre></td></tr>\n"
+        for row in rows
+    )
+    return (
+        "<!doctype html><meta charset='utf-8'><title>Results</title><style>body{font:14px sans-serif}"
+        "td,th{padding:3px 10px;text-align:left;vertical-align:top}pre{margin:0;white-space:pre-wrap}"
+        ".wrong,.failed{background:#fdd}</style><table><tr><th>job</th><th>status</th><th>PSNR (dB)</th>"
+        f"<th>seconds</th><th></th></tr>\n{body}</table>\n"
+    )

@@ -53,10 +53,12 @@ def read_jobs(path: Path) -> list[Job]:
     except FileNotFoundError:
         raise UserError(f"'{path}' does not exist; check the path.") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"'{path}' cannot be read as a file of jobs ({error}); give one with a JSON object "
-                        f"per line.") from error
-    jobs = [_job(line, f"'{path}', line {number}", number)
-            for number, line in enumerate(lines, 1) if line.strip()]
+        raise UserError(
+            f"'{path}' cannot be read as a file of jobs ({error}); give one with a JSON object per line."
+        ) from error
+    jobs = [
+        _job(line, f"'{path}', line {number}", number) for number, line in enumerate(lines, 1) if line.strip()
+    ]
     if not jobs:
         raise UserError(f"'{path}' holds no jobs; give one JSON object per line.")
     names: set[str] = set()
@@ -83,10 +85,12 @@ def _job(line: str, where: str, number: int) -> Job:
         raise UserError(f"{where}: 'arguments' must be a list of texts.")
     name = found.get("name", f"{number:06d}-{command}")
     if not isinstance(name, str) or (trouble := name_trouble(name, in_scene=False)):
-        raise UserError(f"{where}: the name {trouble if isinstance(name, str) else 'is no text'}; give "
-                        f"another.")
-    amounts = {key: found.get(key, default) for key, default in
-               (("cpus", 1.0), ("gpus", 0.0), ("memory_gib", 0.0))}
+        raise UserError(
+            f"{where}: the name {trouble if isinstance(name, str) else 'is no text'}; give another."
+        )
+    amounts = {
+        key: found.get(key, default) for key, default in (("cpus", 1.0), ("gpus", 0.0), ("memory_gib", 0.0))
+    }
     for key, value in amounts.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e6:
             raise UserError(f"{where}: '{key}' must be a number that is not negative.")

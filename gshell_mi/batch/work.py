@@ -80,14 +80,26 @@ def _run(job: Job, out: Path) -> dict:
     environment = dict(os.environ)
     environment.setdefault("OPENBLAS_NUM_THREADS", "1")
     started = time.perf_counter()
-    process = subprocess.run([sys.executable, "-m", f"gshell_mi.{job.command}", *arguments], text=True,
-                             env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                             stderr=subprocess.PIPE, errors="replace", preexec_fn=end_with_parent)
+    process = subprocess.run(
+        [sys.executable, "-m", f"gshell_mi.{job.command}", *arguments],
+        text=True,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        errors="replace",
+        preexec_fn=end_with_parent,
+    )
     code = process.returncode
     told = [line.strip() for line in process.stderr.splitlines() if line.strip()][-_KEPT_LINES:]
-    found = {"name": job.name, "job": _identity(job), "code": code,
-             "status": "done" if code == 0 else "wrong" if code == 2 else "failed",
-             "seconds": round(time.perf_counter() - started, 2), "told": "" if code == 0 else "\n".join(told)}
+    found = {
+        "name": job.name,
+        "job": _identity(job),
+        "code": code,
+        "status": "done" if code == 0 else "wrong" if code == 2 else "failed",
+        "seconds": round(time.perf_counter() - started, 2),
+        "told": "" if code == 0 else "\n".join(told),
+    }
     try:
         score = json.loads((out / "metrics.json").read_text(encoding="utf-8"))["psnr_training"]
         return found | {"psnr": round(float(score), 3)}

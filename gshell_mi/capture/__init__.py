@@ -6,5 +6,13 @@ from .formats import read_capture
 from .frames import Capture, Frame
 from .run import CaptureResult, import_capture
 
-__all__ = ["Camera", "Capture", "CaptureConfig", "CaptureResult", "Distortion", "Frame", "import_capture",
-           "read_capture"]
+__all__ = [
+    "Camera",
+    "Capture",
+    "CaptureConfig",
+    "CaptureResult",
+    "Distortion",
+    "Frame",
+    "import_capture",
+    "read_capture",
+]

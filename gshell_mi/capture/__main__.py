@@ -34,15 +34,22 @@ class _Arguments:
     quiet: bool = False
     """No progress bar."""
     config: Annotated[CaptureConfig, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=CaptureConfig)
+        default_factory=CaptureConfig
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return run_command("capture", "Turn photographs or a video into a scene for gshell_mi.fit.",
-                       _Arguments, _capture, arguments,
-                       interrupted=lambda _: "Interrupted; no scene was written. Steps that were finished "
-                                             "are not done again.")
+    return run_command(
+        "capture",
+        "Turn photographs or a video into a scene for gshell_mi.fit.",
+        _Arguments,
+        _capture,
+        arguments,
+        interrupted=lambda _: (
+            "Interrupted; no scene was written. Steps that were finished are not done again."
+        ),
+    )
 
 
 def _capture(given: _Arguments) -> None:
@@ -64,12 +71,20 @@ def _import(given: _Arguments) -> tuple[str, ...]:
             bar.update(task, description=what, completed=done, total=count)
 
         assert given.output is not None
-        result = import_capture(given.source, given.output, config=given.config, overwrite=given.overwrite,
-                                progress=lambda done, count: show("targets", done, count), steps=show)
+        result = import_capture(
+            given.source,
+            given.output,
+            config=given.config,
+            overwrite=given.overwrite,
+            progress=lambda done, count: show("targets", done, count),
+            steps=show,
+        )
     _warn(result.warnings)
     low, high = (", ".join(f"{value:.3g}" for value in corner) for corner in result.box)
-    print(f"{result.path}: {result.training} training views, {result.held_out} held out, box ({low}) to "
-          f"({high})")
+    print(
+        f"{result.path}: {result.training} training views, {result.held_out} held out, box ({low}) to "
+        f"({high})"
+    )
     if result.made:
         print(f"made: {' and '.join(result.made)}")
     return result.made
@@ -79,7 +94,7 @@ def _check(scene: Path, *, warn: bool) -> None:
     from .check import check_scene
 
     report = check_scene(scene)
-    if warn:    # an import has said the same already
+    if warn:  # an import has said the same already
         _warn(report.warnings)
     print(f"{report.picture}: look at it before the fit")
 

@@ -58,12 +58,16 @@ def acquire(source: Path, output: Path, config: CaptureConfig, progress: Progres
         UserError: of anything that the user can mend.
     """
     workspace = Workspace(output.with_suffix(".work"))
-    posed = config.format is not None or not source.exists() or any(
-        module.find(source) for module in FORMATS.values())
+    posed = (
+        config.format is not None
+        or not source.exists()
+        or any(module.find(source) for module in FORMATS.values())
+    )
     is_video = video.is_video(source)
     if not is_video and (posed or not source.is_dir() or not photographs_in(config.images or source)):
-        capture = read_capture(source, format=config.format, images=config.images,
-                               opencv_axes=config.opencv_axes)
+        capture = read_capture(
+            source, format=config.format, images=config.images, opencv_axes=config.opencv_axes
+        )
         return Acquired(capture, workspace, colmap.find(source) if capture.format == "COLMAP" else None)
     if is_video:
         photographs = video.cut(source, workspace, config.frames, progress)
@@ -82,7 +86,7 @@ def lacks_masks(capture: Capture) -> bool:
 
 
 def _has_alpha(path: Path) -> bool:
-    if path.suffix.lower() in FLOAT_SUFFIXES:    # renderings; whether theirs is any good is told later
+    if path.suffix.lower() in FLOAT_SUFFIXES:  # renderings; whether theirs is any good is told later
         return True
     try:
         with open_image(path) as image:
@@ -91,8 +95,12 @@ def _has_alpha(path: Path) -> bool:
         return True
 
 
-def make_masks(acquired: Acquired, config: CaptureConfig, to_scene: Callable[[Capture], np.ndarray],
-               progress: Progress | None = None) -> None:
+def make_masks(
+    acquired: Acquired,
+    config: CaptureConfig,
+    to_scene: Callable[[Capture], np.ndarray],
+    progress: Progress | None = None,
+) -> None:
     """Gives every frame a mask file, cut out by ``segmentation``.
 
     Args:
@@ -110,11 +118,18 @@ def make_masks(acquired: Acquired, config: CaptureConfig, to_scene: Callable[[Ca
     elif capture.region is not None:
         subject = Subject(capture.region, points[:0], core=_core(capture.region))
     if subject is None:
-        raise UserError(f"The cameras of '{capture.source}' look at no common point, so masks cannot be "
-                        f"made; supply them with --masks, or give --box.")
-    job = {"photographs": fingerprint([frame.image for frame in capture.frames]), "how": config.make_masks,
-           "cameras": [[*camera.to_world.ravel(), camera.fx, camera.cx, camera.cy] for camera in cameras],
-           "background": config.background, "box": subject.box.tolist(), "size": SIZE}
+        raise UserError(
+            f"The cameras of '{capture.source}' look at no common point, so masks cannot be "
+            f"made; supply them with --masks, or give --box."
+        )
+    job = {
+        "photographs": fingerprint([frame.image for frame in capture.frames]),
+        "how": config.make_masks,
+        "cameras": [[*camera.to_world.ravel(), camera.fx, camera.cx, camera.cy] for camera in cameras],
+        "background": config.background,
+        "box": subject.box.tolist(),
+        "size": SIZE,
+    }
     folder = acquired.workspace.step("cut", job)
     files = [folder / f"{index:05}.png" for index in range(len(cameras))]
     if not all(file.is_file() for file in files):
@@ -123,8 +138,10 @@ def make_masks(acquired: Acquired, config: CaptureConfig, to_scene: Callable[[Ca
         for file, mask in zip(files, cut_out(views, subject, progress), strict=True):
             with replacing(file) as partial:
                 Image.fromarray(mask).save(partial)
-    acquired.capture = replace(capture, frames=tuple(
-        replace(frame, mask=file) for frame, file in zip(capture.frames, files, strict=True)))
+    acquired.capture = replace(
+        capture,
+        frames=tuple(replace(frame, mask=file) for frame, file in zip(capture.frames, files, strict=True)),
+    )
     acquired.made.append("masks")
 
 
@@ -157,9 +174,15 @@ def _with_priors(views: list[View], config: CaptureConfig) -> list[View]:
         empty = small_copy(Path(config.background), SIZE)
         for view in views:
             if view.image.shape[1::-1] != empty.size:
-                raise UserError(f"--background '{config.background}' has another aspect than the photographs "
-                                f"have; give one of the place without the object, by the same camera.")
+                raise UserError(
+                    f"--background '{config.background}' has another aspect than the photographs "
+                    f"have; give one of the place without the object, by the same camera."
+                )
         behind = np.array(empty, np.float32)
-        return [replace(view, prior=np.clip(np.abs(view.image - behind).max(axis=-1) / 255 / (2 * _DIFFERS),
-                                            0, 1)) for view in views]
+        return [
+            replace(
+                view, prior=np.clip(np.abs(view.image - behind).max(axis=-1) / 255 / (2 * _DIFFERS), 0, 1)
+            )
+            for view in views
+        ]
     return views

@@ -39,8 +39,13 @@ class Distortion:
         x, y = points[..., 0], points[..., 1]
         rr = x * x + y * y
         radial = 1 + rr * (self.k1 + rr * (self.k2 + rr * (self.k3 + rr * self.k4)))
-        return np.stack([x * radial + 2 * self.p1 * x * y + self.p2 * (rr + 2 * x * x),
-                         y * radial + self.p1 * (rr + 2 * y * y) + 2 * self.p2 * x * y], axis=-1)
+        return np.stack(
+            [
+                x * radial + 2 * self.p1 * x * y + self.p2 * (rr + 2 * x * x),
+                y * radial + self.p1 * (rr + 2 * y * y) + 2 * self.p2 * x * y,
+            ],
+            axis=-1,
+        )
 
     def folds_at(self) -> float:
         """The radius ``r`` from which on the radial part runs backwards; infinity if it never does.
@@ -120,16 +125,27 @@ class Camera:
 
         Of the camera without its distortion; as in ``gshell_mi.views.PinholeViews``.
         """
-        film = np.array([[self.width / self.fx, 0, -self.cx / self.fx],
-                         [0, self.height / self.fy, -self.cy / self.fy],
-                         [0, 0, 1]])
+        film = np.array(
+            [
+                [self.width / self.fx, 0, -self.cx / self.fx],
+                [0, self.height / self.fy, -self.cy / self.fy],
+                [0, 0, 1],
+            ]
+        )
         return self.to_world[:3, :3] @ film
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for a copy of its image in another size."""
         sx, sy = width / self.width, height / self.height
-        return replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy,
-                       cx=self.cx * sx, cy=self.cy * sy)
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
 
     def moved(self, transform: np.ndarray) -> Camera:
         """The same camera in a world that ``transform`` (4, 4), a rigid motion, has moved."""

@@ -83,8 +83,9 @@ def check_scene(scene: str | Path, picture: str | Path | None = None) -> CheckRe
         with replacing(picture) as partial:
             sheet.draw().save(partial, "PNG", pnginfo=tag)
     except OSError as error:
-        raise UserError(f"'{picture}' cannot be written ({error.strerror or error}); mend its "
-                        f"permissions.") from error
+        raise UserError(
+            f"'{picture}' cannot be written ({error.strerror or error}); mend its permissions."
+        ) from error
     return CheckReport(picture, tuple(sheet.warnings))
 
 
@@ -104,12 +105,14 @@ class _Sheet:
             name = f"{sensor.id()} ({Path(image).name})" if image else sensor.id()
             self.thumbnails.append(Thumbnail.of(name, target.rgba, camera, clipped, target.known))
         box = np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
-        self.warnings = find_trouble(self.thumbnails, box, record.to_scene,
-                                     has_alpha=all(target.has_alpha for target in scene.targets))
+        self.warnings = find_trouble(
+            self.thumbnails, box, record.to_scene, has_alpha=all(target.has_alpha for target in scene.targets)
+        )
         self.hull = _hull(scene, [thumbnail.silhouette for thumbnail in self.thumbnails])
         if self.hull is None:
-            self.warnings.append("The masks have no common volume in the box: a fit of this scene will "
-                                 "refuse to start.")
+            self.warnings.append(
+                "The masks have no common volume in the box: a fit of this scene will refuse to start."
+            )
         self.font = ImageFont.load_default(_FONT)
 
     def draw(self) -> Image.Image:
@@ -134,13 +137,19 @@ class _Sheet:
         return sheet
 
     def _header(self, width: int) -> list[tuple[str, tuple[int, int, int]]]:
-        low, high = (", ".join(f"{value:.3g}" for value in corner)
-                     for corner in (self.corners.min(axis=0), self.corners.max(axis=0)))
+        low, high = (
+            ", ".join(f"{value:.3g}" for value in corner)
+            for corner in (self.corners.min(axis=0), self.corners.max(axis=0))
+        )
         sizes = {(camera.width, camera.height) for camera in self.cameras}
-        about = (f"{self.scene.path.name}: {len(self.cameras)} views of "
-                 f"{' / '.join(f'{w} x {h}' for w, h in sorted(sizes)[:3])} pixels, box ({low}) to ({high})")
-        legend = ("orange: box   magenta: visual hull   red, green, blue: x, y, z   blue areas: unknown   "
-                  "red camera: the first")
+        about = (
+            f"{self.scene.path.name}: {len(self.cameras)} views of "
+            f"{' / '.join(f'{w} x {h}' for w, h in sorted(sizes)[:3])} pixels, box ({low}) to ({high})"
+        )
+        legend = (
+            "orange: box   magenta: visual hull   red, green, blue: x, y, z   blue areas: unknown   "
+            "red camera: the first"
+        )
         warnings = self.warnings or ["No trouble found."]
         lines = [(about, _INK), (legend, _INK)]
         for warning in warnings:
@@ -187,7 +196,7 @@ class _Sheet:
         pose = np.eye(4)
         distance = 3.0 * radius
         pose[:3] = np.stack([right, -np.cross(towards, right), -towards, self.center + distance * towards], 1)
-        size = 2 * _OVERVIEW    # drawn at twice its size, so that thin lines come out smooth
+        size = 2 * _OVERVIEW  # drawn at twice its size, so that thin lines come out smooth
         focal = size / 2 / math.tan(math.asin(radius / distance))
         return Camera(size, size, focal, focal, size / 2, size / 2, pose)
 
@@ -207,8 +216,9 @@ class _Sheet:
             self._frustum(pen, observer, self.cameras[index], _FRUSTUM if index else _FIRST)
         return image.resize((_OVERVIEW, _OVERVIEW), Image.Resampling.BOX)
 
-    def _frustum(self, pen: ImageDraw.ImageDraw, observer: Camera, camera: Camera,
-                 color: tuple[int, int, int]) -> None:
+    def _frustum(
+        self, pen: ImageDraw.ImageDraw, observer: Camera, camera: Camera, color: tuple[int, int, int]
+    ) -> None:
         """A pyramid as deep as an eighth of its distance to the box, its upper side marked."""
         depth = np.linalg.norm(camera.center - self.center) / 8
         film = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1], [0.5, -0.25, 1]])
@@ -225,14 +235,20 @@ def _hull(scene: FitScene, silhouettes: list[Silhouette]) -> mi.Scene | None:
     lattice = TetLattice(_HULL_CELLS)
     points = mi.Transform4f(scene.subject.to_world) @ mi.Point3f(lattice.points(mi.Float))
     seen = [s for s in silhouettes if not s.is_empty]
-    views = PinholeViews(tuple(map(str, range(len(seen)))),
-                         np.array([(s.camera.width, s.camera.height) for s in seen]),
-                         np.array([s.camera.center for s in seen]),
-                         np.array([s.camera.basis() for s in seen]))
-    distance = visual_hull(points, views, [s.possible for s in seen],
-                           daylight_votes=FitConfig().hull.daylight_votes)
-    sdf = np.clip(distance.numpy() / np.abs(np.linalg.det(
-        np.array(scene.subject.to_world.matrix)[:3, :3])) ** (1 / 3), -1, 1)
+    views = PinholeViews(
+        tuple(map(str, range(len(seen)))),
+        np.array([(s.camera.width, s.camera.height) for s in seen]),
+        np.array([s.camera.center for s in seen]),
+        np.array([s.camera.basis() for s in seen]),
+    )
+    distance = visual_hull(
+        points, views, [s.possible for s in seen], daylight_votes=FitConfig().hull.daylight_votes
+    )
+    sdf = np.clip(
+        distance.numpy() / np.abs(np.linalg.det(np.array(scene.subject.to_world.matrix)[:3, :3])) ** (1 / 3),
+        -1,
+        1,
+    )
     if not (sdf < 0).any():
         return None
     surface = extract(lattice, mi.Float(sdf), dr.ones(mi.Float, lattice.vertex_count))
@@ -246,7 +262,7 @@ def _hull(scene: FitScene, silhouettes: list[Silhouette]) -> mi.Scene | None:
 
 def _normals(hull: mi.Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """(height, width, 3) normals of the hull that the pixels see, and (height, width) whether they see it."""
-    v, u = np.mgrid[0.5:camera.height, 0.5:camera.width]
+    v, u = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
     film = np.stack([u / camera.width, v / camera.height, np.ones_like(u)], axis=-1).reshape(-1, 3)
     directions = film @ camera.basis().T
     rays = mi.Ray3f(mi.Point3f(camera.center), dr.normalize(mi.Vector3f(directions.T.astype(np.float32))))
@@ -264,8 +280,14 @@ def _with_outline(image: Image.Image, mask: np.ndarray, color: tuple[int, int, i
     return Image.fromarray(pixels)
 
 
-def _line(pen: ImageDraw.ImageDraw, camera: Camera, start: np.ndarray, end: np.ndarray,
-          color: tuple[int, int, int], width: int = 1) -> None:
+def _line(
+    pen: ImageDraw.ImageDraw,
+    camera: Camera,
+    start: np.ndarray,
+    end: np.ndarray,
+    color: tuple[int, int, int],
+    width: int = 1,
+) -> None:
     """The image of a segment in the world, cut off shortly before the camera's plane."""
     points = np.stack([start, end])
     depth = (points - camera.center) @ camera.forward

@@ -52,31 +52,43 @@ def _match(folder: Path, job: dict) -> None:
     if job["camera"]:
         focal, width, height = job["camera"]
         reader.camera_params = f"{focal}, {width / 2}, {height / 2}, 0"
-    pycolmap.extract_features(database, folder / "images", image_names=names, camera_mode=mode,
-                              reader_options=reader, extraction_options=extraction,
-                              device=pycolmap.Device.cpu)
+    pycolmap.extract_features(
+        database,
+        folder / "images",
+        image_names=names,
+        camera_mode=mode,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
     pairs = folder / "pairs.txt"
-    pairs.write_text("".join(f"{first} {second}\n" for first, second
-                             in pairs_of(names, sequential=job["sequential"])), encoding="utf-8")
+    pairs.write_text(
+        "".join(f"{first} {second}\n" for first, second in pairs_of(names, sequential=job["sequential"])),
+        encoding="utf-8",
+    )
     matching = pycolmap.FeatureMatchingOptions()
-    matching.skip_geometric_verification = True    # only once it is known what belongs to the room
+    matching.skip_geometric_verification = True  # only once it is known what belongs to the room
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = pairs
-    pycolmap.match_image_pairs(database, matching_options=matching, pairing_options=pairing,
-                               device=pycolmap.Device.cpu)
+    pycolmap.match_image_pairs(
+        database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
+    )
 
 
 def _verify(folder: Path, job: dict) -> None:
     partial = folder / "partial.db"
     partial.unlink(missing_ok=True)
     with closing(sqlite3.connect(folder / "features.db")) as old, closing(sqlite3.connect(partial)) as new:
-        old.backup(new)    # a copied file would lack what is still in the journal
+        old.backup(new)  # a copied file would lack what is still in the journal
     with pycolmap.Database.open(partial) as database:
         images = [image.image_id for image in database.read_all_images()]
         points = {image: np.array(database.read_keypoints(image))[:, :2] for image in images}
         numbers, found = database.read_all_matches()
-        matches = {pycolmap.pair_id_to_image_pair(number): np.array(pair)
-                   for number, pair in zip(numbers, found, strict=True) if len(pair)}
+        matches = {
+            pycolmap.pair_id_to_image_pair(number): np.array(pair)
+            for number, pair in zip(numbers, found, strict=True)
+            if len(pair)
+        }
         still = stationary_features(points, matches, job["size"])
         share = np.concatenate(list(still.values())).mean() if still else 0.0
         if share > _ROOM:
@@ -87,7 +99,7 @@ def _verify(folder: Path, job: dict) -> None:
     (folder / "room.json").write_text(json.dumps({"share": float(share), "removed": bool(share > _ROOM)}))
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = _SEED
-    options.ransac.max_num_trials = 2000    # more are spent on pairs that show nothing in common
+    options.ransac.max_num_trials = 2000  # more are spent on pairs that show nothing in common
     pycolmap.geometric_verification(partial, two_view_geometry_options=options)
     os.replace(partial, folder / "verified.db")
 
@@ -110,12 +122,13 @@ def _map(folder: Path) -> None:
         with open(progress, "ab") as file:
             file.write(b".")
 
-    pycolmap.incremental_mapping(folder / "verified.db", folder / "images", partial, options=options,
-                                 next_image_callback=placed)
+    pycolmap.incremental_mapping(
+        folder / "verified.db", folder / "images", partial, options=options, next_image_callback=placed
+    )
     shutil.rmtree(folder / "models", ignore_errors=True)
     os.replace(partial, folder / "models")
 
 
 if __name__ == "__main__":
-    end_with_parent()    # two of them in one folder would spoil it
+    end_with_parent()  # two of them in one folder would spoil it
     run(Path(sys.argv[1]))

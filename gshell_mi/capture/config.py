@@ -10,8 +10,11 @@ from ..errors import UserError
 from ..lattice import MOST_CELLS
 
 #: What --up may name beside "auto", "cameras" and "keep".
-AXES = {sign + name: tuple((-1.0 if sign else 1.0) * (axis == index) for index in range(3))
-        for sign in ("", "-") for axis, name in enumerate("xyz")}
+AXES = {
+    sign + name: tuple((-1.0 if sign else 1.0) * (axis == index) for index in range(3))
+    for sign in ("", "-")
+    for axis, name in enumerate("xyz")
+}
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,10 @@ class CaptureConfig:
             if not all(map(math.isfinite, self.box)):
                 raise UserError("--box holds NaN or infinity; give six numbers.")
             if any(low >= high for low, high in zip(self.box[:3], self.box[3:], strict=True)):
-                raise UserError(f"--box {' '.join(f'{value:g}' for value in self.box)} is empty: each of x0 "
-                                f"y0 z0 must be below x1 y1 z1.")
+                raise UserError(
+                    f"--box {' '.join(f'{value:g}' for value in self.box)} is empty: each of x0 "
+                    f"y0 z0 must be below x1 y1 z1."
+                )
         if self.max_size < 0:
             raise UserError(f"--max-size must not be negative, and is {self.max_size}.")
         if self.hold_out < 0 or self.hold_out == 1:
@@ -81,8 +86,10 @@ class CaptureConfig:
         if not 4 <= self.resolution <= MOST_CELLS:
             raise UserError(f"--resolution must be from 4 to {MOST_CELLS} cells, not {self.resolution}.")
         if not (math.isfinite(self.background_tolerance) and self.background_tolerance >= 0):
-            raise UserError(f"--background-tolerance must be a number that is not negative, unlike "
-                            f"{self.background_tolerance:g}.")
+            raise UserError(
+                f"--background-tolerance must be a number that is not negative, unlike "
+                f"{self.background_tolerance:g}."
+            )
         if self.up not in (*AXES, "auto", "cameras", "keep"):
             raise UserError(f"--up '{self.up}' is unknown; choose {', '.join(AXES)}, cameras, keep or auto.")
         if self.make_masks not in ("grabcut", "rembg", "off"):

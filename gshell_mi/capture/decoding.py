@@ -72,11 +72,15 @@ def read_pixels(path: Path) -> np.ndarray:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] > 4 or pixels.dtype.kind not in "uf":
-        raise UserError(f"Image '{path}' has the layout {pixels.shape} of {pixels.dtype}; write it as a "
-                        f"grey, RGB or RGBA image of 8, 16 or floating point bits.")
+        raise UserError(
+            f"Image '{path}' has the layout {pixels.shape} of {pixels.dtype}; write it as a "
+            f"grey, RGB or RGBA image of 8, 16 or floating point bits."
+        )
     if pixels.dtype.kind == "f" and (bad := float_images.first_not_finite(pixels)):
-        raise UserError(f"Image '{path}' holds NaN or infinity (first at column {bad[0]}, row {bad[1]}); "
-                        f"mend those pixels.")
+        raise UserError(
+            f"Image '{path}' holds NaN or infinity (first at column {bad[0]}, row {bad[1]}); "
+            f"mend those pixels."
+        )
     grey, alpha = pixels[..., :1], pixels[..., 1:]
     if pixels.shape[2] <= 2:
         pixels = np.concatenate([grey, grey, grey, alpha], axis=-1)
@@ -148,16 +152,19 @@ class ColorDecoding:
     def _to_rec709(self) -> np.ndarray | None:
         """Of row vectors."""
         colour = colour_science()
-        matrix = colour.matrix_RGB_to_RGB(colour.RGB_COLOURSPACES[self.color_space],
-                                          colour.RGB_COLOURSPACES[_REC709])
+        matrix = colour.matrix_RGB_to_RGB(
+            colour.RGB_COLOURSPACES[self.color_space], colour.RGB_COLOURSPACES[_REC709]
+        )
         return None if np.allclose(matrix, np.eye(3), atol=1e-3) else matrix.T.astype(np.float32)
 
 
 def _known(name: str, names: Collection[str], option: str, what: str) -> None:
     if name not in names:
         near = difflib.get_close_matches(name, list(names), n=1, cutoff=0.3) or sorted(names)[:1]
-        raise UserError(f"{option} '{name}' is no {what} that colour-science knows; the nearest that it "
-                        f"knows is '{near[0]}'.")
+        raise UserError(
+            f"{option} '{name}' is no {what} that colour-science knows; the nearest that it "
+            f"knows is '{near[0]}'."
+        )
 
 
 def color_profile(path: Path) -> str | None:
@@ -196,5 +203,5 @@ def exif_exposure(path: Path) -> float | None:
         iso = float(sensitivity[0] if isinstance(sensitivity, tuple) else sensitivity)
         exposure = float(np.log2(seconds * iso / 100 / aperture**2))
     except (KeyError, OSError, SyntaxError, TypeError, ValueError, ZeroDivisionError):
-        return None    # reading the pixels will complain of a broken file
+        return None  # reading the pixels will complain of a broken file
     return exposure if np.isfinite(exposure) else None

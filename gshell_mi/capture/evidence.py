@@ -46,8 +46,9 @@ def wide_grey(mask: np.ndarray) -> np.ndarray:
         for axis in (0, 1):
             shift = -1 if width % 2 == 0 and not smallest else 0
             filter = ndimage.minimum_filter1d if smallest else ndimage.maximum_filter1d
-            result = filter(result.view(np.uint8), width, axis=axis, mode="constant", cval=0,
-                            origin=shift).view(bool)
+            result = filter(
+                result.view(np.uint8), width, axis=axis, mode="constant", cval=0, origin=shift
+            ).view(bool)
     return result
 
 
@@ -71,13 +72,19 @@ def assign_ignored(capture: Capture, folder: Path | None) -> Capture:
     copies = Copies(frame.image.as_posix() for frame in capture.frames)
     found = [copies.find(folder, frame.image.as_posix(), mask_of) for frame in capture.frames]
     # In the folder of the capture itself, the images are named like the images.
-    found = [None if file and file.samefile(frame.image) else file
-             for file, frame in zip(found, capture.frames, strict=True)]
+    found = [
+        None if file and file.samefile(frame.image) else file
+        for file, frame in zip(found, capture.frames, strict=True)
+    ]
     if given and not any(found):
-        raise UserError(f"No file in '{folder}' is named like an image; name each as its image, as in "
-                        f"'{capture.frames[0].image.stem}.png', or leave out --ignore.")
-    return replace(capture, frames=tuple(replace(frame, ignored=file)
-                                         for frame, file in zip(capture.frames, found, strict=True)))
+        raise UserError(
+            f"No file in '{folder}' is named like an image; name each as its image, as in "
+            f"'{capture.frames[0].image.stem}.png', or leave out --ignore."
+        )
+    return replace(
+        capture,
+        frames=tuple(replace(frame, ignored=file) for frame, file in zip(capture.frames, found, strict=True)),
+    )
 
 
 def read_ignored(frame: Frame, shape: tuple[int, int], reduction: int, white: float = 1.0) -> np.ndarray:
@@ -94,6 +101,8 @@ def read_ignored(frame: Frame, shape: tuple[int, int], reduction: int, white: fl
     values = stretched(mask_values(frame.ignored), white)
     matched = match_frame(values, frame, shape, reduction)
     if matched is None:
-        raise UserError(f"Ignore mask '{frame.ignored}' is {values.shape[1]} x {values.shape[0]} pixels, but "
-                        f"its image is {frame.camera.width} x {frame.camera.height}; resize it.")
+        raise UserError(
+            f"Ignore mask '{frame.ignored}' is {values.shape[1]} x {values.shape[0]} pixels, but "
+            f"its image is {frame.camera.width} x {frame.camera.height}; resize it."
+        )
     return matched

@@ -25,7 +25,7 @@ def existing(named: Path) -> Path | None:
         if found is not None or not named.name or (folder := _existing_folder(named.parent)) is None:
             return found
         there = _by_spelling(str(folder), folder.stat().st_mtime_ns)
-    except (OSError, ValueError):    # names that cannot be a file's
+    except (OSError, ValueError):  # names that cannot be a file's
         return None
     keys = [_spelling(named.name), *(_spelling(named.name + suffix) for suffix in SUFFIXES)]
     return next((folder / there[key] for key in keys if key in there), None)
@@ -49,8 +49,14 @@ def _existing_folder(named: Path) -> Path | None:
     parent = _existing_folder(named.parent) if named.parent != named else None
     if parent is None or named.name.isascii():
         return None
-    return next((folder for folder in sorted(parent.iterdir())
-                 if folder.is_dir() and _composed(folder.name) == _composed(named.name)), None)
+    return next(
+        (
+            folder
+            for folder in sorted(parent.iterdir())
+            if folder.is_dir() and _composed(folder.name) == _composed(named.name)
+        ),
+        None,
+    )
 
 
 @lru_cache(maxsize=16)
@@ -99,7 +105,7 @@ class Copies:
         """
         for tail in _tails(_parts(name)):
             if self._shared[(*tail[:-1], Path(tail[-1]).stem)] > 1:
-                return None    # shorter tails are shared as well
+                return None  # shorter tails are shared as well
             if len(tail) == 1 or (folder / tail[0]).is_dir():
                 found = file(folder.joinpath(*tail))
                 if found is not None:

@@ -55,8 +55,9 @@ class _Patch:
         middle = subject.box.mean(axis=0)
         first = unit(np.cross(normal, np.eye(3)[np.abs(normal).argmin()]))
         half = _REACH * np.ptp(subject.box, axis=0).max()
-        return cls(middle - (middle @ normal + offset) * normal,
-                   half * np.stack([first, np.cross(normal, first)]))
+        return cls(
+            middle - (middle @ normal + offset) * normal, half * np.stack([first, np.cross(normal, first)])
+        )
 
     def points(self) -> np.ndarray:
         """(``_TEXELS`` squared, 3) the texels' centres, row by row."""
@@ -72,12 +73,16 @@ class _Patch:
             distance = ((self.center - camera.center) @ normal) / (rays @ normal)
             distance[distance <= 0] = np.nan
             offset = camera.center + distance[..., None] * rays - self.center
-            return np.moveaxis(offset @ (self.axes / (self.axes**2).sum(axis=1)[:, None]).T, -1, 0) * (
-                _TEXELS / 2) + (_TEXELS - 1) / 2
+            return (
+                np.moveaxis(offset @ (self.axes / (self.axes**2).sum(axis=1)[:, None]).T, -1, 0)
+                * (_TEXELS / 2)
+                + (_TEXELS - 1) / 2
+            )
 
 
-def floor_evidence(images: Sequence[np.ndarray], cameras: Sequence[Camera],
-                   subject: Subject) -> list[np.ndarray]:
+def floor_evidence(
+    images: Sequence[np.ndarray], cameras: Sequence[Camera], subject: Subject
+) -> list[np.ndarray]:
     """Per image (height, width): -1 where it shows the floor, 1 where something before it, and 0 where no
     floor is behind it that enough other images show alike.
 
@@ -91,8 +96,14 @@ def floor_evidence(images: Sequence[np.ndarray], cameras: Sequence[Camera],
     images = [ndimage.gaussian_filter(image.astype(np.float32), (_BLUR, _BLUR, 0)) for image in images]
     few = -(-len(images) // _MOST)
     points = patch.points()
-    texture, noise = _texture(np.stack([_colors(image, camera, points, subject) for image, camera in
-                                        zip(images[::few], cameras[::few], strict=True)]))
+    texture, noise = _texture(
+        np.stack(
+            [
+                _colors(image, camera, points, subject)
+                for image, camera in zip(images[::few], cameras[::few], strict=True)
+            ]
+        )
+    )
     found = []
     for image, camera in zip(images, cameras, strict=True):
         off = np.abs(image - _sampled(texture, patch.texel(camera))).max(axis=-1) / noise
@@ -107,7 +118,7 @@ def _texture(seen: np.ndarray) -> tuple[np.ndarray, float]:
     """What most images show of the floor, (``_TEXELS``, ``_TEXELS``, 3), NaN where they do not agree or would
     anyway, and their noise; from what each shows, (images, texels, 3)."""
     told = np.isfinite(seen[..., 0]).sum(axis=0)
-    middle = np.maximum(told - 1, 0)[None, :, None] // 2    # NaN is sorted to the end
+    middle = np.maximum(told - 1, 0)[None, :, None] // 2  # NaN is sorted to the end
     median = np.take_along_axis(np.sort(seen, axis=0), middle, axis=0)[0]
     off = np.abs(seen - median).max(axis=2)
     noise = max(_LEAST_NOISE, 1.5 * float(np.nanmedian(off)) if told.any() else 0)
@@ -155,5 +166,11 @@ def _sampled(image: np.ndarray, at: np.ndarray) -> np.ndarray:
     import cv2
 
     row, column = np.nan_to_num(np.clip(at, -9, 1e4), nan=-9).astype(np.float32)
-    return cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
-                     borderValue=(np.nan, np.nan, np.nan))
+    return cv2.remap(
+        image,
+        column,
+        row,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(np.nan, np.nan, np.nan),
+    )

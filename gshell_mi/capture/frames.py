@@ -61,8 +61,10 @@ class Capture:
 
     def holding_out(self, every: int) -> Capture:
         """With each ``every``-th frame held out, beginning with the first, as LLFF's papers do."""
-        frames = tuple(replace(frame, held_out=frame.held_out or index % every == 0)
-                       for index, frame in enumerate(self.frames))
+        frames = tuple(
+            replace(frame, held_out=frame.held_out or index % every == 0)
+            for index, frame in enumerate(self.frames)
+        )
         return replace(self, frames=frames)
 
 
@@ -87,8 +89,9 @@ def pose_of(matrix: object, owner: str) -> np.ndarray:
     try:
         return rigid(array)
     except ValueError as problem:
-        raise UserError(f"The pose of {owner} {problem}; export the capture again as rigid camera-to-world "
-                        f"matrices.") from None
+        raise UserError(
+            f"The pose of {owner} {problem}; export the capture again as rigid camera-to-world matrices."
+        ) from None
 
 
 def camera_for_image(declared: Camera, size: tuple[int, int], image: Path) -> Camera:
@@ -99,18 +102,25 @@ def camera_for_image(declared: Camera, size: tuple[int, int], image: Path) -> Ca
     """
     width, height = size
     if not _is_possible(declared):
-        raise UserError(f"The camera of image '{image}' has impossible intrinsics ({declared.width} x "
-                        f"{declared.height} pixels, focal lengths {declared.fx:g}, {declared.fy:g}, centre "
-                        f"{declared.cx:g}, {declared.cy:g}, {declared.distortion}); export it again.")
+        raise UserError(
+            f"The camera of image '{image}' has impossible intrinsics ({declared.width} x "
+            f"{declared.height} pixels, focal lengths {declared.fx:g}, {declared.fy:g}, centre "
+            f"{declared.cx:g}, {declared.cy:g}, {declared.distortion}); export it again."
+        )
     if (declared.width, declared.height) == size:
         return declared
     # A size that is rounded to whole pixels changes the aspect by up to a pixel.
     if abs(width * declared.height / declared.width - height) > 1.0:
         turned = (declared.height, declared.width) == size
-        cure = ("it seems turned by its EXIF orientation: store it as the calibration saw it" if turned
-                else "take the images that the cameras were calibrated on")
-        raise UserError(f"Image '{image}' is {width} x {height} pixels, but its camera is declared for "
-                        f"{declared.width} x {declared.height}; {cure}.")
+        cure = (
+            "it seems turned by its EXIF orientation: store it as the calibration saw it"
+            if turned
+            else "take the images that the cameras were calibrated on"
+        )
+        raise UserError(
+            f"Image '{image}' is {width} x {height} pixels, but its camera is declared for "
+            f"{declared.width} x {declared.height}; {cure}."
+        )
     return declared.resized(width, height)
 
 
@@ -121,5 +131,10 @@ def _is_possible(camera: Camera) -> bool:
         return False
     longest = max(camera.width, camera.height)
     focal = sorted((camera.fx, camera.fy))
-    return (min(camera.width, camera.height) >= 1 and 1e-3 * longest < focal[0] and focal[1] < 1e5 * longest
-            and max(abs(camera.cx), abs(camera.cy)) < 100 * longest and max(map(abs, lens)) < 1e4)
+    return (
+        min(camera.width, camera.height) >= 1
+        and 1e-3 * longest < focal[0]
+        and focal[1] < 1e5 * longest
+        and max(abs(camera.cx), abs(camera.cy)) < 100 * longest
+        and max(map(abs, lens)) < 1e4
+    )

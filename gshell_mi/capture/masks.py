@@ -17,8 +17,10 @@ from .reduced import match_frame, read_reduced_grey
 #: Folders that data sets keep masks in, beside the images' folder or in the capture's.
 _FOLDERS = ("masks", "mask")
 
-_SUPPLY = ("supply images with alpha, a folder of masks (white on the object) as 'masks' beside the images "
-           "or with --masks, or the colour behind the object with --background")
+_SUPPLY = (
+    "supply images with alpha, a folder of masks (white on the object) as 'masks' beside the images "
+    "or with --masks, or the colour behind the object with --background"
+)
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,9 @@ class Background:
         try:
             red, green, blue = ImageColor.getrgb(text)[:3]
         except ValueError:
-            raise UserError(f"--background '{text}' is no colour; give one as white, black or "
-                            f"'#00ff00'.") from None
+            raise UserError(
+                f"--background '{text}' is no colour; give one as white, black or '#00ff00'."
+            ) from None
         if not tolerance > 0:
             raise UserError(f"--background-tolerance must be positive, and is {tolerance:g}.")
         return cls((red / 255, green / 255, blue / 255), tolerance)
@@ -76,13 +79,18 @@ def assign_masks(capture: Capture, folder: Path | None) -> Capture:
         if any(frame.mask for frame in capture.frames):
             missing = next((frame for frame in capture.frames if not frame.mask), None)
             if missing:
-                raise UserError(f"The capture names masks, but none for '{missing.image}'; add it, or give "
-                                f"a folder of masks with --masks.")
-            lost = next((frame.mask for frame in capture.frames
-                         if frame.mask and not frame.mask.is_file()), None)
+                raise UserError(
+                    f"The capture names masks, but none for '{missing.image}'; add it, or give "
+                    f"a folder of masks with --masks."
+                )
+            lost = next(
+                (frame.mask for frame in capture.frames if frame.mask and not frame.mask.is_file()), None
+            )
             if lost:
-                raise UserError(f"Mask '{lost}' is missing, with or without a suffix such as .png; put it "
-                                f"there, or give a folder of masks with --masks.")
+                raise UserError(
+                    f"Mask '{lost}' is missing, with or without a suffix such as .png; put it "
+                    f"there, or give a folder of masks with --masks."
+                )
             return capture
         folder = _beside(capture)
         if folder is None:
@@ -94,13 +102,16 @@ def assign_masks(capture: Capture, folder: Path | None) -> Capture:
     if not any(found):
         inside = images_in(folder)
         if len(inside) != len(capture.frames):
-            raise UserError(f"The masks in '{folder}' have neither the images' names nor their number "
-                            f"({len(inside)} masks, {len(capture.frames)} images); name each as its image.")
+            raise UserError(
+                f"The masks in '{folder}' have neither the images' names nor their number "
+                f"({len(inside)} masks, {len(capture.frames)} images); name each as its image."
+            )
         found = inside
     for mask, frame in zip(found, capture.frames, strict=True):
         if mask is None:
-            raise UserError(f"Image '{frame.image}' has no mask in '{folder}'; add "
-                            f"'{frame.image.stem}.png' there.")
+            raise UserError(
+                f"Image '{frame.image}' has no mask in '{folder}'; add '{frame.image.stem}.png' there."
+            )
     frames = tuple(replace(frame, mask=mask) for frame, mask in zip(capture.frames, found, strict=True))
     return replace(capture, frames=frames)
 
@@ -122,8 +133,15 @@ def mask_of(image: Path) -> Path | None:
     return exact or existing(image.with_name(image.stem)) or existing(image)
 
 
-def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None = None, *,
-                inverted: bool = False, reduction: int = 1, white: float = 1.0) -> np.ndarray:
+def coverage_of(
+    frame: Frame,
+    pixels: np.ndarray,
+    background: Background | None = None,
+    *,
+    inverted: bool = False,
+    reduction: int = 1,
+    white: float = 1.0,
+) -> np.ndarray:
     """(h, w) coverage in [0, 1] of a frame with the given stored pixels.
 
     A given background colour comes first, then the frame's mask, then alpha.
@@ -145,16 +163,19 @@ def coverage_of(frame: Frame, pixels: np.ndarray, background: Background | None 
             mask = mask_values(frame.mask)
             coverage = match_frame(mask, frame, pixels.shape[:2], reduction)
             if coverage is None:
-                raise UserError(f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its "
-                                f"image is {size[0]} x {size[1]}; resize it.")
+                raise UserError(
+                    f"Mask '{frame.mask}' is {mask.shape[1]} x {mask.shape[0]} pixels, but its "
+                    f"image is {size[0]} x {size[1]}; resize it."
+                )
         coverage = stretched(coverage, white)
         return 1 - coverage if inverted else coverage
     if pixels.shape[2] < 4:
         raise UserError(f"Image '{frame.image}' has no alpha, and there is no mask for it; {_SUPPLY}.")
     alpha = np.clip(_unit(pixels[..., 3]), 0, 1)
     if (alpha == 1).all():
-        raise UserError(f"Image '{frame.image}' has an alpha of 1 everywhere, and there is no mask for it; "
-                        f"{_SUPPLY}.")
+        raise UserError(
+            f"Image '{frame.image}' has an alpha of 1 everywhere, and there is no mask for it; {_SUPPLY}."
+        )
     return alpha if alpha_values(pixels) is None else stretched(alpha, white)
 
 
@@ -170,7 +191,7 @@ def mask_values(path: Path) -> np.ndarray:
     values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
     values = _unit(values, mask.dtype)
     if mask.dtype.kind == "f" and (top := float(values.max(initial=0))) >= 2:
-        values = values / (255 if top <= 255 else 65535)    # what integers held
+        values = values / (255 if top <= 255 else 65535)  # what integers held
     return np.clip(values, 0, 1)
 
 

@@ -25,12 +25,16 @@ def object_probability(image: np.ndarray) -> np.ndarray:
 def _session() -> tuple:
     try:
         import rembg  # pyright: ignore[reportMissingImports]  # an extra
-    except (ImportError, SystemExit):    # it ends the process where it finds no onnxruntime
-        raise UserError("--make-masks rembg needs the package: install it with `pip install "
-                        "'gshell_mi[rembg]'`, or choose grabcut.") from None
+    except (ImportError, SystemExit):  # it ends the process where it finds no onnxruntime
+        raise UserError(
+            "--make-masks rembg needs the package: install it with `pip install "
+            "'gshell_mi[rembg]'`, or choose grabcut."
+        ) from None
     try:
         return rembg, rembg.new_session("u2net")
-    except Exception as error:    # a download that fails, by whatever library does it
+    except Exception as error:  # a download that fails, by whatever library does it
         reason = (str(error).strip().splitlines() or [repr(error)])[0]
-        raise UserError(f"rembg's model cannot be had ({reason}); connect to the internet once, put the "
-                        f"model where rembg looks for it, or choose --make-masks grabcut.") from error
+        raise UserError(
+            f"rembg's model cannot be had ({reason}); connect to the internet once, put the "
+            f"model where rembg looks for it, or choose --make-masks grabcut."
+        ) from error

@@ -19,5 +19,9 @@ def pairs_of(names: Sequence[str], *, sequential: bool) -> list[tuple[str, str]]
     251
     """
     count = len(names)
-    return [(names[i], names[j]) for i in range(count) for j in range(i + 1, count)
-            if not sequential or j - i <= _OVERLAP or i % _LOOP == j % _LOOP == 0]
+    return [
+        (names[i], names[j])
+        for i in range(count)
+        for j in range(i + 1, count)
+        if not sequential or j - i <= _OVERLAP or i % _LOOP == j % _LOOP == 0
+    ]

@@ -15,8 +15,9 @@ Result = TypeVar("Result")
 _MOST = 4
 
 
-def in_order(work: Callable[[Item], Result], items: Iterable[Item], *,
-             threads: int | None = None) -> Iterator[Result]:
+def in_order(
+    work: Callable[[Item], Result], items: Iterable[Item], *, threads: int | None = None
+) -> Iterator[Result]:
     """The results of ``work`` on each item, in order; threads work ahead, but never by more than twice their
     number.
 

@@ -73,8 +73,14 @@ class Preparation:
             UserError: the image or its mask cannot be used.
         """
         pixels, reduction = read_reduced(frame.image, _DECODED * self.max_size)
-        coverage = coverage_of(frame, pixels, self.background, inverted=self.inverted_masks,
-                               reduction=reduction, white=self.white)[..., None]
+        coverage = coverage_of(
+            frame,
+            pixels,
+            self.background,
+            inverted=self.inverted_masks,
+            reduction=reduction,
+            white=self.white,
+        )[..., None]
         rgb = self.decoding.linear(pixels[..., :3])
         # In place, for a photograph of 24 megapixels takes 300 MB by now.
         if self.background is not None:
@@ -90,8 +96,13 @@ class Preparation:
         inside = framed(camera)
         image, camera = rectify(small, camera)
         known = image[..., 4] * inside
-        return Prepared(image[..., :4], camera, _clipped(pixels, coverage), float(coverage.max()),
-                        None if known.all() else known)
+        return Prepared(
+            image[..., :4],
+            camera,
+            _clipped(pixels, coverage),
+            float(coverage.max()),
+            None if known.all() else known,
+        )
 
     def _known(self, frame: Frame, coverage: np.ndarray, reduction: int) -> np.ndarray:
         """(h, w, 1) the share of each pixel of which something is known."""
@@ -149,8 +160,10 @@ def _stops_from_file(file: Path, images: list[Path]) -> list[float]:
     try:
         table = {name: float(value) for name, value in read_json_object(file).items()}
     except (OSError, ValueError, TypeError, OverflowError) as error:
-        raise UserError(f"--exposures '{file}' is no JSON object of stops by file name ({error}); write "
-                        f"{{\"IMG_1.jpg\": 0.0, \"IMG_2.jpg\": -1.5}}.") from error
+        raise UserError(
+            f"--exposures '{file}' is no JSON object of stops by file name ({error}); write "
+            f'{{"IMG_1.jpg": 0.0, "IMG_2.jpg": -1.5}}.'
+        ) from error
     for image in images:
         if not math.isfinite(table.get(image.name, math.nan)):
             raise UserError(f"--exposures '{file}' has no finite exposure for '{image.name}'; add it.")

@@ -16,9 +16,15 @@ from .frames import Frame
 _JPEG = (".jpg", ".jpeg")
 #: From an image as EXIF orientation shows it to as it is stored: photographs are read as stored, as
 #: calibrations see them, but tools that make masks may turn them.
-_TURNED_BACK = {2: lambda mask: mask[:, ::-1], 3: lambda mask: np.rot90(mask, 2), 4: lambda mask: mask[::-1],
-                5: lambda mask: mask.swapaxes(0, 1), 6: lambda mask: np.rot90(mask),
-                7: lambda mask: np.rot90(mask, 2).swapaxes(0, 1), 8: lambda mask: np.rot90(mask, -1)}
+_TURNED_BACK = {
+    2: lambda mask: mask[:, ::-1],
+    3: lambda mask: np.rot90(mask, 2),
+    4: lambda mask: mask[::-1],
+    5: lambda mask: mask.swapaxes(0, 1),
+    6: lambda mask: np.rot90(mask),
+    7: lambda mask: np.rot90(mask, 2).swapaxes(0, 1),
+    8: lambda mask: np.rot90(mask, -1),
+}
 
 
 def read_reduced(path: Path, longest: int) -> tuple[np.ndarray, int]:
@@ -46,9 +52,9 @@ def read_reduced(path: Path, longest: int) -> tuple[np.ndarray, int]:
             image.draft(image.mode, wanted)
             if image.size != tuple(-(-size // reduction) for size in before):
                 return read_pixels(path), 1
-            pixels = np.array(image)[:wanted[1], :wanted[0]]
+            pixels = np.array(image)[: wanted[1], : wanted[0]]
     except (OSError, SyntaxError, ValueError):
-        return read_pixels(path), 1    # which tells what is wrong with the file
+        return read_pixels(path), 1  # which tells what is wrong with the file
     return (np.stack([pixels] * 3, axis=-1) if pixels.ndim == 2 else pixels), reduction
 
 
@@ -61,9 +67,15 @@ def reduced_camera(camera: Camera, reduction: int) -> Camera:
     """
     if reduction == 1:
         return camera
-    return replace(camera, width=camera.width // reduction, height=camera.height // reduction,
-                   fx=camera.fx / reduction, fy=camera.fy / reduction, cx=camera.cx / reduction,
-                   cy=camera.cy / reduction)
+    return replace(
+        camera,
+        width=camera.width // reduction,
+        height=camera.height // reduction,
+        fx=camera.fx / reduction,
+        fy=camera.fy / reduction,
+        cx=camera.cx / reduction,
+        cy=camera.cy / reduction,
+    )
 
 
 def read_reduced_grey(path: Path, size: tuple[int, int], reduction: int) -> np.ndarray | None:
@@ -80,7 +92,7 @@ def read_reduced_grey(path: Path, size: tuple[int, int], reduction: int) -> np.n
             box = (0, 0, size[0] // reduction * reduction, size[1] // reduction * reduction)
             return np.array(image.convert("L").reduce(reduction, box), np.float32) / 255
     except (OSError, SyntaxError, ValueError):
-        return None    # reading it in full tells what is wrong
+        return None  # reading it in full tells what is wrong
 
 
 def match_frame(mask: np.ndarray, frame: Frame, shape: tuple[int, int], reduction: int) -> np.ndarray | None:
@@ -96,8 +108,9 @@ def match_frame(mask: np.ndarray, frame: Frame, shape: tuple[int, int], reductio
     return matched
 
 
-def match_size(mask: np.ndarray, size: tuple[int, int], shape: tuple[int, int],
-               reduction: int) -> np.ndarray | None:
+def match_size(
+    mask: np.ndarray, size: tuple[int, int], shape: tuple[int, int], reduction: int
+) -> np.ndarray | None:
     """A mask, of its image's size or another of the same aspect, at the size of the reduced image.
 
     Args:
@@ -115,7 +128,7 @@ def match_size(mask: np.ndarray, size: tuple[int, int], shape: tuple[int, int],
     # A size that is rounded to whole pixels changes the aspect by up to a pixel.
     if abs(width * size[1] / size[0] - height) > 1.0:
         return None
-    scale = np.array([width / size[0], height / size[1]]) * reduction    # mask pixels per pixel
+    scale = np.array([width / size[0], height / size[1]]) * reduction  # mask pixels per pixel
     reach = np.maximum(np.ceil(scale * shape[::-1] - 1e-6).astype(int) - [width, height], 0)
     padded = np.pad(mask, ((0, reach[1]), (0, reach[0])), mode="edge")
     filter = Image.Resampling.BOX if scale.min() >= 1 else Image.Resampling.BILINEAR

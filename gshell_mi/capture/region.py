@@ -139,7 +139,7 @@ def find_box(silhouettes: list[Silhouette], region: np.ndarray | None = None) ->
             return None
         low, high = inside.min(axis=0) - spacing / 2, inside.max(axis=0) + spacing / 2
         extent = (high - low).max() / 2
-        if extent > half * 0.999:    # it goes on beyond the cube
+        if extent > half * 0.999:  # it goes on beyond the cube
             center, half = (low + high) / 2, 1.6 * half
             continue
         settled = extent > 0.75 * half
@@ -155,7 +155,7 @@ def agreement(silhouettes: list[Silhouette], box: np.ndarray, rays: int = 32) ->
     With right cameras it is 1 up to the masks' errors. Of very many views, some spread over the rest make up
     the common volume, so that the time grows with the number of views and not with its square.
     """
-    judges = silhouettes[::-(-len(silhouettes) // _MOST_JUDGES)]
+    judges = silhouettes[:: -(-len(silhouettes) // _MOST_JUDGES)]
     rng = np.random.default_rng(0)
     center, half = box.mean(axis=0), np.ptp(box, axis=0).max() / 2
     # Along a ray, from its entry into the sphere around the box to its exit.
@@ -203,13 +203,14 @@ def likely_misreading(silhouettes: list[Silhouette], to_scene: np.ndarray, limit
         to_scene: (4, 4) how the world was turned after the cameras had been read.
         limit: of the number of views that are tried.
     """
-    some = silhouettes[::max(len(silhouettes) // limit, 1)]
+    some = silhouettes[:: max(len(silhouettes) // limit, 1)]
     to_capture = np.linalg.inv(to_scene)
     best, name = 0.9, None
     for candidate, reread in _MISREADINGS:
         poses = [reread(to_capture @ s.camera.to_world) for s in some]
-        changed = [replace(s, camera=replace(s.camera, to_world=pose))
-                   for s, pose in zip(some, poses, strict=True)]
+        changed = [
+            replace(s, camera=replace(s.camera, to_world=pose)) for s, pose in zip(some, poses, strict=True)
+        ]
         box = find_box(changed)
         if box is not None and (score := float(agreement(changed, box).mean())) > best:
             best, name = score, candidate

@@ -44,8 +44,16 @@ def shrink(image: np.ndarray, camera: Camera, max_size: int) -> tuple[np.ndarray
     image = (rows @ image.reshape(camera.height, -1)).reshape(height, camera.width, channels)
     image = image.transpose(1, 0, 2).reshape(camera.width, -1)
     image = (columns @ image).reshape(width, height, channels).transpose(1, 0, 2)
-    small = replace(camera, width=width, height=height, fx=camera.fx * scale, fy=camera.fy * scale,
-                    cx=camera.cx * scale, cy=camera.cy * scale, rfilter="box")
+    small = replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * scale,
+        fy=camera.fy * scale,
+        cx=camera.cx * scale,
+        cy=camera.cy * scale,
+        rfilter="box",
+    )
     return np.ascontiguousarray(image), small
 
 
@@ -57,8 +65,9 @@ def _area_weights(size: int, new: int, scale: float) -> sparse.csr_array:
     overlap = np.minimum(index + 1, (start + 1 / scale)[:, None]) - np.maximum(index, start[:, None])
     overlap = np.where(index < size, np.clip(overlap, 0, None), 0)
     row = np.repeat(np.arange(new), reach)
-    weights = sparse.csr_array((overlap.ravel().astype(np.float32),
-                                 (row, np.minimum(index, size - 1).ravel())), shape=(new, size))
+    weights = sparse.csr_array(
+        (overlap.ravel().astype(np.float32), (row, np.minimum(index, size - 1).ravel())), shape=(new, size)
+    )
     # The last new pixel may end a rounding error beyond the image.
     return sparse.diags_array(1 / weights.sum(axis=1)) @ weights
 
@@ -92,7 +101,7 @@ def framed(camera: Camera) -> np.ndarray:
 
 def _seen(camera: Camera, straight: Camera) -> np.ndarray:
     """(height, width, 2) where ``camera`` shows the centres of the pixels of ``straight``."""
-    v, u = np.mgrid[0.5:camera.height, 0.5:camera.width]
+    v, u = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
     ideal = np.stack([(u - straight.cx) / straight.fx, (v - straight.cy) / straight.fy], axis=-1)
     # Beyond the fold the polynomial leads back into the image, where that point of the scene is not.
     radius = np.linalg.norm(ideal, axis=-1, keepdims=True)
@@ -109,6 +118,11 @@ def _sample(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarra
     rows = [np.clip(np.floor(row).astype(int) + step, 0, height - 1) for step in (0, 1)]
     columns = [np.clip(np.floor(column).astype(int) + step, 0, width - 1) for step in (0, 1)]
     around = np.stack([image[r, c] for r in rows for c in columns])
-    cubic = np.stack([ndimage.map_coordinates(image[..., c], [row, column], order=3, mode="nearest")
-                      for c in range(channels)], axis=-1)
+    cubic = np.stack(
+        [
+            ndimage.map_coordinates(image[..., c], [row, column], order=3, mode="nearest")
+            for c in range(channels)
+        ],
+        axis=-1,
+    )
     return np.clip(cubic, around.min(axis=0), around.max(axis=0))

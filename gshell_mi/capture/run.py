@@ -58,10 +58,15 @@ class CaptureResult:
     made: tuple[str, ...] = ()
 
 
-def import_capture(source: str | Path, output: str | Path, *, config: CaptureConfig | None = None,
-                   overwrite: bool = False,
-                   progress: Callable[[int, int], None] | None = None,
-                   steps: Progress | None = None) -> CaptureResult:
+def import_capture(
+    source: str | Path,
+    output: str | Path,
+    *,
+    config: CaptureConfig | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    steps: Progress | None = None,
+) -> CaptureResult:
     """Turns photographs into a fit scene; cameras and masks that they lack are made.
 
     A Mitsuba ``llvm`` or ``cuda`` variant must be set. Writes ``output`` (an XML file) and beside it the
@@ -92,8 +97,14 @@ def import_capture(source: str | Path, output: str | Path, *, config: CaptureCon
 
 
 class _Import:
-    def __init__(self, source: Path, output: Path, config: CaptureConfig,
-                 progress: Callable[[int, int], None] | None, steps: Progress | None):
+    def __init__(
+        self,
+        source: Path,
+        output: Path,
+        config: CaptureConfig,
+        progress: Callable[[int, int], None] | None,
+        steps: Progress | None,
+    ):
         self.config, self.output, self.progress = config, output, progress
         decoding = ColorDecoding(config.color_space, config.transfer)
         background = None
@@ -116,17 +127,30 @@ class _Import:
         if not capture.training:
             raise UserError(f"'{source}' has no training views; all are held out.")
         self.to_scene = to_scene(capture, config.up)
-        self.capture = replace(capture, frames=tuple(
-            replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames))
+        self.capture = replace(
+            capture,
+            frames=tuple(
+                replace(frame, camera=frame.camera.moved(self.to_scene)) for frame in capture.frames
+            ),
+        )
         gains = exposure_gains(capture, config.exposures, exif=not config.no_exif)
         given = background is None and "masks" not in self.made
         white = white_of(self.capture.frames) if given else 1.0
-        self.preparation = Preparation(decoding, background, config.invert_masks, config.max_size, gains,
-                                       white, ignored_white_of(self.capture.frames))
+        self.preparation = Preparation(
+            decoding,
+            background,
+            config.invert_masks,
+            config.max_size,
+            gains,
+            white,
+            ignored_white_of(self.capture.frames),
+        )
         self.warnings = [*capture.notes, *_profile_warning(capture, config)]
         if white < 1:
-            self.warnings.append(f"The object's value in the masks is {255 * white:.3g} of 255 "
-                                 f"({white:.2g}); it is taken for white, which is 1, and so are larger ones.")
+            self.warnings.append(
+                f"The object's value in the masks is {255 * white:.3g} of 255 "
+                f"({white:.2g}); it is taken for white, which is 1, and so are larger ones."
+            )
         if given:
             self.capture, turned = with_turned_masks(self.capture, white, config.invert_masks)
             self.warnings += turned
@@ -137,8 +161,9 @@ class _Import:
 
     def inputs(self) -> set[Path]:
         """The files that are read and could be mistaken for some that are written."""
-        files = {file for frame in self.capture.frames for file in (frame.image, frame.mask, frame.ignored)
-                 if file}
+        files = {
+            file for frame in self.capture.frames for file in (frame.image, frame.mask, frame.ignored) if file
+        }
         files |= {Path(file) for file in (self.config.light, self.config.background) if file is not None}
         if self.capture.format == mitsuba.NAME and (scene := mitsuba.find(self.capture.source)):
             files |= scene_inputs(scene)
@@ -159,8 +184,9 @@ class _Import:
         # Names that the locale cannot spell come as escaped bytes, and go back as these.
         (partial / self.output.name).write_text(document, encoding="utf-8", errors="surrogateescape")
         write_record(folder, self._record(box))
-        return CaptureResult(self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings),
-                             self.made)
+        return CaptureResult(
+            self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings), self.made
+        )
 
     def _write_targets(self, folder: Path) -> None:
         empty, faint, most, frames = [], {}, 0.0, self.capture.frames
@@ -171,7 +197,7 @@ class _Import:
             check_interrupt()
             most = max(most, target.covered)
             if not frame.held_out and not (target.rgba[..., 3] >= 0.5).any():
-                empty.append(frame.image.name)    # it would carve away everything that it frames
+                empty.append(frame.image.name)  # it would carve away everything that it frames
                 continue
             if target.covered < FULL:
                 faint[frame.image.name] = target.covered
@@ -185,24 +211,35 @@ class _Import:
                 self.tests[name] = target.camera
             else:
                 self.cameras[name] = target.camera
-                self.thumbnails.append(Thumbnail.of(f"{name} ({frame.image.name})", target.rgba,
-                                                    target.camera, target.clipped, target.known))
+                self.thumbnails.append(
+                    Thumbnail.of(
+                        f"{name} ({frame.image.name})",
+                        target.rgba,
+                        target.camera,
+                        target.clipped,
+                        target.known,
+                    )
+                )
             self.views.append(self._view_record(name, frame, target.clipped))
             if self.progress:
                 self.progress(index + 1, len(self.capture.frames))
         if not self.cameras:
-            raise UserError(f"The masks of all images of '{self.capture.source}' are empty (their largest "
-                            f"coverage is {most:.2g}); masks are white, and alpha is 1, on the object.")
+            raise UserError(
+                f"The masks of all images of '{self.capture.source}' are empty (their largest "
+                f"coverage is {most:.2g}); masks are white, and alpha is 1, on the object."
+            )
         if empty:
             some = ", ".join(empty[:3]) + (" ..." if len(empty) > 3 else "")
             what = "view with an empty mask is" if len(empty) == 1 else "views with empty masks are"
             self.warnings.append(f"{len(empty)} {what} left out: {some}.")
         if faint:
             some = ", ".join(f"{name} ({share:.2f})" for name, share in list(faint.items())[:3])
-            self.warnings.append(f"{counted(len(faint), 'mask')} nowhere "
-                                 f"{'reaches' if len(faint) == 1 else 'reach'} full coverage; the largest is "
-                                 f"{some}{' ...' if len(faint) > 3 else ''}: the object counts as half "
-                                 f"transparent; write masks that are white (255, 1.0) on the object.")
+            self.warnings.append(
+                f"{counted(len(faint), 'mask')} nowhere "
+                f"{'reaches' if len(faint) == 1 else 'reach'} full coverage; the largest is "
+                f"{some}{' ...' if len(faint) > 3 else ''}: the object counts as half "
+                f"transparent; write masks that are white (255, 1.0) on the object."
+            )
 
     def _box(self) -> np.ndarray:
         if self.config.box is not None:
@@ -213,7 +250,7 @@ class _Import:
             turned = self.to_scene[:3, :3] @ region.mean(axis=0)
             region = _cube(region) - region.mean(axis=0) + turned
         box = find_box(silhouettes, region)
-        if box is None and region is not None:    # such as a unit sphere that nobody has fitted to the object
+        if box is None and region is not None:  # such as a unit sphere that nobody has fitted to the object
             box = find_box(silhouettes)
         if box is None:
             misreading = likely_misreading(silhouettes, self.to_scene)
@@ -255,11 +292,20 @@ class _Import:
         return record
 
     def _record(self, box: np.ndarray) -> dict:
-        options = {name: str(value) if isinstance(value, Path) else value
-                   for name, value in dataclasses.asdict(self.config).items() if value is not None}
-        return {"format": self.capture.format, "source": str(self.capture.source),
-                "capture_to_scene": self.to_scene.tolist(), "box": box.tolist(), "options": options,
-                "warnings": self.warnings, "views": self.views}
+        options = {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in dataclasses.asdict(self.config).items()
+            if value is not None
+        }
+        return {
+            "format": self.capture.format,
+            "source": str(self.capture.source),
+            "capture_to_scene": self.to_scene.tolist(),
+            "box": box.tolist(),
+            "options": options,
+            "warnings": self.warnings,
+            "views": self.views,
+        }
 
 
 def _cube(box: np.ndarray) -> np.ndarray:
@@ -275,8 +321,10 @@ def _profile_warning(capture: Capture, config: CaptureConfig) -> list[str]:
     profile = color_profile(capture.training[0].image)
     if profile is None or "srgb" in profile.lower():
         return []
-    return [f"The photographs carry the colour profile '{profile}', but are read as sRGB: name their colour "
-            f"space with --color-space."]
+    return [
+        f"The photographs carry the colour profile '{profile}', but are read as sRGB: name their colour "
+        f"space with --color-space."
+    ]
 
 
 def to_scene(capture: Capture, up: str) -> np.ndarray:
@@ -290,7 +338,7 @@ def to_scene(capture: Capture, up: str) -> np.ndarray:
     direction = np.array(AXES[up]) if up in AXES else capture.up if up == "auto" else None
     if direction is None:
         direction = np.mean([frame.camera.up for frame in capture.frames], axis=0)
-        if np.linalg.norm(direction) < 0.2:    # turned every way
+        if np.linalg.norm(direction) < 0.2:  # turned every way
             return np.eye(4)
         direction /= np.linalg.norm(direction)
     return _rotation_to_y(direction)

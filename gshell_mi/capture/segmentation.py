@@ -65,8 +65,9 @@ class View:
         if by == 1:
             return self
         size = (self.camera.width // by, self.camera.height // by)
-        prior, floor = (None if values is None else _resized(values, size)
-                        for values in (self.prior, self.floor))
+        prior, floor = (
+            None if values is None else _resized(values, size) for values in (self.prior, self.floor)
+        )
         image = np.array(Image.fromarray(self.image).resize(size, Image.Resampling.BOX))
         return View(image, self.camera.resized(*size), prior, floor)
 
@@ -91,12 +92,15 @@ def cut_out(views: list[View], subject: Subject, progress: Progress | None = Non
     try:
         import cv2  # noqa: F401
     except ImportError:
-        raise UserError("The photographs have no masks, and making them takes OpenCV: install it with `pip "
-                        "install 'gshell_mi[masks]'`, or supply masks.") from None
+        raise UserError(
+            "The photographs have no masks, and making them takes OpenCV: install it with `pip "
+            "install 'gshell_mi[masks]'`, or supply masks."
+        ) from None
     done = 0
 
-    def cut(reduction: int, grid: _Voxels, hull: np.ndarray | None,
-            masks: Sequence[np.ndarray | None]) -> tuple[list[View], list[np.ndarray]]:
+    def cut(
+        reduction: int, grid: _Voxels, hull: np.ndarray | None, masks: Sequence[np.ndarray | None]
+    ) -> tuple[list[View], list[np.ndarray]]:
         nonlocal done
         reduced, cuts = [view.reduced(reduction) for view in views], []
         for mask in in_order(partial(_cut, subject, grid, hull), list(zip(reduced, masks, strict=True))):
@@ -108,8 +112,10 @@ def cut_out(views: list[View], subject: Subject, progress: Progress | None = Non
 
     reduced = [view.reduced(_ROUNDS[0][0]) for view in views]
     evidence = floor_evidence([view.image for view in reduced], [view.camera for view in reduced], subject)
-    views = [replace(view, floor=_resized(floor, view.image.shape[1::-1]))
-             for view, floor in zip(views, evidence, strict=True)]
+    views = [
+        replace(view, floor=_resized(floor, view.image.shape[1::-1]))
+        for view, floor in zip(views, evidence, strict=True)
+    ]
     for _ in range(_GROWTHS):
         grid = _Voxels(subject, _ROUNDS[0][1])
         reduced, masks = cut(_ROUNDS[0][0], grid, None, [None] * len(views))
@@ -128,13 +134,16 @@ def _hull(grid: _Voxels, views: list[View], masks: list[np.ndarray]) -> np.ndarr
     """(n,) the voxels at the surface of the hull; the others are seen behind these in every view."""
     hull = grid.carve(views, masks)
     if not hull.any():
-        raise UserError("The object could not be told from its background; supply masks with --masks, or "
-                        "give --background or --box.")
+        raise UserError(
+            "The object could not be told from its background; supply masks with --masks, or "
+            "give --background or --box."
+        )
     return grid.surface(hull)
 
 
-def _cut(subject: Subject, grid: _Voxels, hull: np.ndarray | None,
-         work: tuple[View, np.ndarray | None]) -> np.ndarray:
+def _cut(
+    subject: Subject, grid: _Voxels, hull: np.ndarray | None, work: tuple[View, np.ndarray | None]
+) -> np.ndarray:
     view, mask = work
     if mask is not None:
         mask = _resized(mask, view.image.shape[1::-1])
@@ -185,7 +194,7 @@ class _Voxels:
             against[which] += framed & ~mask[row, column]
         kept = self.allowed & (against <= _DISSENT * seen) & (seen >= max(2, 0.3 * len(views)))
         label, count = ndimage.label(kept.reshape(self.shape))
-        if count > 1:    # the object is one thing, perhaps with loose parts of some size
+        if count > 1:  # the object is one thing, perhaps with loose parts of some size
             volume = np.bincount(label.ravel())
             volume[0] = 0
             kept &= (volume >= 0.02 * volume.max())[label].ravel()
@@ -219,16 +228,18 @@ class _Voxels:
         result[row[framed], column[framed]] = True
         # A voxel's image is larger than a pixel.
         reach = int(np.ceil(self.pixels_per_voxel(camera) / 2))
-        return ndimage.binary_closing(np.pad(result, reach), np.ones((3, 3)),
-                                      iterations=reach)[reach:-reach, reach:-reach]
+        return ndimage.binary_closing(np.pad(result, reach), np.ones((3, 3)), iterations=reach)[
+            reach:-reach, reach:-reach
+        ]
 
     def pixels_per_voxel(self, camera: Camera) -> float:
         depth = (self.points.mean(axis=0) - camera.center) @ camera.forward
         return float(self.size * camera.fx / max(depth, 1e-9))
 
 
-def _trimap(view: View, subject: Subject, grid: _Voxels, hull: np.ndarray | None,
-            mask: np.ndarray | None) -> np.ndarray:
+def _trimap(
+    view: View, subject: Subject, grid: _Voxels, hull: np.ndarray | None, mask: np.ndarray | None
+) -> np.ndarray:
     """What is known of a view, in OpenCV's codes."""
     import cv2
 
@@ -282,13 +293,22 @@ def _grab_cut(image: np.ndarray, trimap: np.ndarray) -> np.ndarray:
     # The background's colours are learned from what is near: a margin of a quarter of the box.
     rows, columns = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
     margin = max(len(rows), len(columns)) // 4
-    window = (slice(max(rows[0] - margin, 0), rows[-1] + margin), slice(max(columns[0] - margin, 0),
-                                                                      columns[-1] + margin))
+    window = (
+        slice(max(rows[0] - margin, 0), rows[-1] + margin),
+        slice(max(columns[0] - margin, 0), columns[-1] + margin),
+    )
     marked = trimap[window].copy()
     cv2.setRNGSeed(0)
     nowhere = (0, 0, 0, 0)  # the mask says where to begin
-    cv2.grabCut(np.ascontiguousarray(image[window]), marked, nowhere, np.zeros((1, 65)), np.zeros((1, 65)), 4,
-                cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(
+        np.ascontiguousarray(image[window]),
+        marked,
+        nowhere,
+        np.zeros((1, 65)),
+        np.zeros((1, 65)),
+        4,
+        cv2.GC_INIT_WITH_MASK,
+    )
     result = np.zeros(trimap.shape, bool)
     result[window] = np.isin(marked, (cv2.GC_FGD, cv2.GC_PR_FGD))
     return result

@@ -49,8 +49,10 @@ def staged(output: Path, *, overwrite: bool, source: Path) -> Iterator[Staging]:
             yield Staging(partial, output)
             _put_in_place(partial, output)
     except OSError as error:
-        raise UserError(f"'{output}' cannot be written ({error.strerror or error}); free some space, mend "
-                        f"its permissions or choose another output.") from error
+        raise UserError(
+            f"'{output}' cannot be written ({error.strerror or error}); free some space, mend "
+            f"its permissions or choose another output."
+        ) from error
 
 
 def _own(output: Path) -> OwnFolder:
@@ -59,22 +61,30 @@ def _own(output: Path) -> OwnFolder:
 
 def _check(output: Path, *, overwrite: bool, source: Path) -> None:
     if output.suffix != ".xml":
-        raise UserError(f"The output '{output}' must end in .xml; the targets go into a folder of the same "
-                        f"name beside it.")
+        raise UserError(
+            f"The output '{output}' must end in .xml; the targets go into a folder of the same "
+            f"name beside it."
+        )
     if trouble := name_trouble(output.name):
         raise UserError(f"The name of the output '{str(output)[:80]}' {trouble}; choose another name.")
     own, folder = _own(output), output.with_suffix("")
     if folder.exists() and folder.resolve() in (source.resolve(), *source.resolve().parents):
-        raise UserError(f"The output '{output}' would put its targets into '{folder}', where the capture is; "
-                        f"choose another name.")
+        raise UserError(
+            f"The output '{output}' would put its targets into '{folder}', where the capture is; "
+            f"choose another name."
+        )
     there = next((path for path in (output, folder) if os.path.lexists(path)), None)
     if there is not None and not overwrite:
         raise UserError(f"'{there}' exists; replace it with --overwrite, or choose another output.")
-    for path, ours in ((folder, own.is_marked() and not folder.is_symlink()),
-                       (output, own.lists_beside(output.name) and not output.is_symlink())):
+    for path, ours in (
+        (folder, own.is_marked() and not folder.is_symlink()),
+        (output, own.lists_beside(output.name) and not output.is_symlink()),
+    ):
         if os.path.lexists(path) and not ours:
-            raise UserError(f"'{path}' was not written by gshell_mi.capture, so --overwrite leaves it alone; "
-                            f"move it away or choose another output.")
+            raise UserError(
+                f"'{path}' was not written by gshell_mi.capture, so --overwrite leaves it alone; "
+                f"move it away or choose another output."
+            )
 
 
 @contextmanager

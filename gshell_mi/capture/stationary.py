@@ -21,8 +21,9 @@ _ENOUGH = 12
 _PARTNERS, _SHARE = 5, 0.12
 
 
-def stationary_features(keypoints: dict[int, np.ndarray], matches: dict[tuple[int, int], np.ndarray],
-                        size: float) -> dict[int, np.ndarray]:
+def stationary_features(
+    keypoints: dict[int, np.ndarray], matches: dict[tuple[int, int], np.ndarray], size: float
+) -> dict[int, np.ndarray]:
     """Finds the features of a room that stands still.
 
     Args:

@@ -39,8 +39,14 @@ def photographs_in(source: Path) -> list[Path]:
     return images_in(source) or images_in(source / "images")
 
 
-def place(photographs: list[Path], source: Path, workspace: Workspace, *, sequential: bool = False,
-          progress: Progress | None = None) -> tuple[Capture, Path]:
+def place(
+    photographs: list[Path],
+    source: Path,
+    workspace: Workspace,
+    *,
+    sequential: bool = False,
+    progress: Progress | None = None,
+) -> tuple[Capture, Path]:
     """Finds the cameras of photographs.
 
     Where the photographs show a room that stands still around an object that turns, the room is left out.
@@ -59,16 +65,24 @@ def place(photographs: list[Path], source: Path, workspace: Workspace, *, sequen
         UserError: ``pycolmap`` is missing, or COLMAP finds no cameras.
     """
     if importlib.util.find_spec("pycolmap") is None:
-        raise UserError(f"'{source}' has no cameras, and finding them takes COLMAP: install it with `pip "
-                        f"install 'gshell_mi[colmap]'`.")
+        raise UserError(
+            f"'{source}' has no cameras, and finding them takes COLMAP: install it with `pip "
+            f"install 'gshell_mi[colmap]'`."
+        )
     if len(photographs) < 3:
-        raise UserError(f"'{source}' has only {len(photographs)} photographs; 20 or more are needed, from "
-                        f"all around the object.")
+        raise UserError(
+            f"'{source}' has only {len(photographs)} photographs; 20 or more are needed, from "
+            f"all around the object."
+        )
     sequential = sequential or len(photographs) > _ALL_PAIRS
-    job = {"photographs": fingerprint(photographs), "sequential": sequential, **_lens(photographs),
-           "images": [f"{index:05}.jpg" for index in range(len(photographs))],
-           "features": _FEATURES,
-           "size": max(max(_scaled(image_size(path), _SIZE)) for path in photographs)}
+    job = {
+        "photographs": fingerprint(photographs),
+        "sequential": sequential,
+        **_lens(photographs),
+        "images": [f"{index:05}.jpg" for index in range(len(photographs))],
+        "features": _FEATURES,
+        "size": max(max(_scaled(image_size(path), _SIZE)) for path in photographs),
+    }
     folder = workspace.step("colmap", job)
     if not (folder / "models").is_dir():
         _write_copies(photographs, folder / "images", progress)
@@ -81,8 +95,11 @@ def _lens(photographs: list[Path]) -> dict:
     kinds = {(image_size(path), _focal_35mm(path)) for path in photographs}
     (size, focal), *others = kinds
     copy = _scaled(size, _SIZE)
-    return {"single_camera": not others, "camera_model": "SIMPLE_RADIAL",
-            "camera": [focal / 36 * max(copy), *copy] if focal and not others else None}
+    return {
+        "single_camera": not others,
+        "camera_model": "SIMPLE_RADIAL",
+        "camera": [focal / 36 * max(copy), *copy] if focal and not others else None,
+    }
 
 
 def _focal_35mm(path: Path) -> float | None:
@@ -122,7 +139,7 @@ def small_copy(path: Path, size: int) -> Image.Image:
         try:
             with open_image(path) as image:
                 wanted = _scaled(image.size, size)
-                image.draft("RGB", wanted)    # decodes no more than is needed
+                image.draft("RGB", wanted)  # decodes no more than is needed
                 return image.convert("RGB").resize(wanted, Image.Resampling.BOX)
         except Exception as error:
             raise UserError(f"Image '{path}' cannot be read ({error}); copy or export it again.") from error
@@ -156,8 +173,10 @@ def _run_colmap(folder: Path, job: dict, progress: Progress | None) -> None:
             worker.kill()
             worker.wait()
     if worker.returncode != 0:
-        raise UserError(f"COLMAP ended with code {worker.returncode}; '{log}' says why, and the same command "
-                        f"goes on where it stopped.")
+        raise UserError(
+            f"COLMAP ended with code {worker.returncode}; '{log}' says why, and the same command "
+            f"goes on where it stopped."
+        )
 
 
 def _state(folder: Path, job: dict) -> Iterator[tuple[str, int, int]]:
@@ -170,9 +189,9 @@ def _state(folder: Path, job: dict) -> Iterator[tuple[str, int, int]]:
     try:
         address = (folder / "features.db").absolute().as_uri() + "?mode=ro"
         with closing(sqlite3.connect(address, uri=True, timeout=0.1)) as base:
-            features, = base.execute("SELECT COUNT(*) FROM keypoints").fetchone()
-            matches, = base.execute("SELECT COUNT(*) FROM matches").fetchone()
-    except sqlite3.Error:    # not there yet, or being written
+            (features,) = base.execute("SELECT COUNT(*) FROM keypoints").fetchone()
+            (matches,) = base.execute("SELECT COUNT(*) FROM matches").fetchone()
+    except sqlite3.Error:  # not there yet, or being written
         return
     if matches:
         yield "matches", matches, len(pairs_of(job["images"], sequential=job["sequential"]))
@@ -183,9 +202,11 @@ def _state(folder: Path, job: dict) -> Iterator[tuple[str, int, int]]:
 def _largest(folder: Path, photographs: list[Path], source: Path) -> tuple[Capture, Path]:
     models = [model for model in (folder / "models").iterdir() if colmap.find(model)]
     if not models:
-        raise UserError(f"COLMAP found no cameras for '{source}': the photographs overlap too little or have "
-                        f"too little texture; take them in small steps, with something textured under and "
-                        f"around the object.")
+        raise UserError(
+            f"COLMAP found no cameras for '{source}': the photographs overlap too little or have "
+            f"too little texture; take them in small steps, with something textured under and "
+            f"around the object."
+        )
     captures = [(colmap.read(model, folder / "images"), model) for model in sorted(models)]
     capture, model = max(captures, key=lambda found: len(found[0].frames))
     frames = []
@@ -204,6 +225,8 @@ def _notes(folder: Path, photographs: list[Path], found: set[Path]) -> tuple[str
         notes.append(f"COLMAP placed {len(found)} of {len(photographs)} photographs; {some} are left out.")
     room = json.loads((folder / "room.json").read_text())
     if room["removed"]:
-        notes.append(f"The room stands still while the object turns ({100 * room['share']:.0f} % of the "
-                     f"features), so cameras are found from what turns.")
+        notes.append(
+            f"The room stands still while the object turns ({100 * room['share']:.0f} % of the "
+            f"features), so cameras are found from what turns."
+        )
     return tuple(notes)

@@ -38,8 +38,14 @@ class Thumbnail:
     known: np.ndarray | None = None
 
     @classmethod
-    def of(cls, name: str, rgba: np.ndarray, camera: Camera, clipped: float = 0.0,
-           known: np.ndarray | None = None) -> Thumbnail:
+    def of(
+        cls,
+        name: str,
+        rgba: np.ndarray,
+        camera: Camera,
+        clipped: float = 0.0,
+        known: np.ndarray | None = None,
+    ) -> Thumbnail:
         small, small_camera = shrink(rgba, camera, MASK_SIZE)
         known = None if known is None else shrink(known[..., None], camera, MASK_SIZE)[0][..., 0]
         return cls(name, small_camera, small, clipped, known)
@@ -49,8 +55,9 @@ class Thumbnail:
         return Silhouette(self.camera, self.rgba[..., 3], self.known)
 
 
-def find_trouble(thumbnails: list[Thumbnail], box: np.ndarray, to_scene: np.ndarray, *,
-                 has_alpha: bool = True) -> list[str]:
+def find_trouble(
+    thumbnails: list[Thumbnail], box: np.ndarray, to_scene: np.ndarray, *, has_alpha: bool = True
+) -> list[str]:
     """Sentences that name what is likely wrong with training views and the box (2, 3); often none.
 
     Args:
@@ -59,8 +66,10 @@ def find_trouble(thumbnails: list[Thumbnail], box: np.ndarray, to_scene: np.ndar
     """
     found = []
     if len(thumbnails) < ENOUGH_VIEWS:
-        found.append(f"There are only {len(thumbnails)} training views; take {ENOUGH_VIEWS} or more, from "
-                     f"all around the object.")
+        found.append(
+            f"There are only {len(thumbnails)} training views; take {ENOUGH_VIEWS} or more, from "
+            f"all around the object."
+        )
     found += _colors(thumbnails)
     if not has_alpha:
         return [*found, "Some targets have no alpha, so neither masks nor cameras can be judged."]
@@ -70,12 +79,15 @@ def find_trouble(thumbnails: list[Thumbnail], box: np.ndarray, to_scene: np.ndar
         found.append(f"The masks of {_names(empty)} are empty: those views say that the object is not there.")
     inverted = [t for t in seen if _is_inverted(t.rgba[..., 3])]
     if inverted:
-        found.append(f"The masks of {_names(inverted)} seem inverted: they cover the border, not the middle; "
-                     f"coverage is 1 (white) on the object; --invert-masks reads them the other way round.")
+        found.append(
+            f"The masks of {_names(inverted)} seem inverted: they cover the border, not the middle; "
+            f"coverage is 1 (white) on the object; --invert-masks reads them the other way round."
+        )
     full = [t for t in seen if t.rgba[..., 3].min() >= 0.5]
     if full:
-        found.append(f"The masks of {_names(full)} cover the whole image, so they say nothing of the "
-                     "outline.")
+        found.append(
+            f"The masks of {_names(full)} cover the whole image, so they say nothing of the outline."
+        )
     if seen:
         found += _geometry(seen, box, to_scene)
     return found
@@ -89,7 +101,7 @@ def _names(thumbnails: list[Thumbnail]) -> str:
 def _is_inverted(alpha: np.ndarray) -> bool:
     border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     height, width = alpha.shape
-    middle = alpha[height // 4:height - height // 4, width // 4:width - width // 4]
+    middle = alpha[height // 4 : height - height // 4, width // 4 : width - width // 4]
     return bool(border.mean() > 0.7 and middle.mean() < border.mean() - 0.2)
 
 
@@ -97,12 +109,16 @@ def _colors(thumbnails: list[Thumbnail]) -> list[str]:
     found = []
     flat = [t for t in thumbnails if _is_flat(t.rgba)]
     if flat:
-        found.append(f"The images {_names(flat)} are nearly all one colour on the object; nothing in them "
-                     f"can be matched with other views.")
+        found.append(
+            f"The images {_names(flat)} are nearly all one colour on the object; nothing in them "
+            f"can be matched with other views."
+        )
     clipped = sorted((t for t in thumbnails if t.clipped > _CLIPPED), key=lambda t: -t.clipped)
     if clipped:
-        found.append(f"Highlights are clipped in {_names(clipped)} (up to {100 * clipped[0].clipped:.0f} % "
-                     f"of the object): the light will come out too dim; expose less, or shoot raw or HDR.")
+        found.append(
+            f"Highlights are clipped in {_names(clipped)} (up to {100 * clipped[0].clipped:.0f} % "
+            f"of the object): the light will come out too dim; expose less, or shoot raw or HDR."
+        )
     return found
 
 
@@ -124,9 +140,11 @@ def _geometry(seen: list[Thumbnail], box: np.ndarray, to_scene: np.ndarray) -> l
     elif own is not None:
         worst = int(missed.argmax())
         low, high = (" ".join(f"{value:.3g}" for value in corner) for corner in own)
-        found.append(f"The box misses the object: {100 * missed.mean():.0f} % of the masks lie beside it "
-                     f"({100 * missed[worst]:.0f} % in {seen[worst].name}); --box {low} {high} would hold "
-                     "it.")
+        found.append(
+            f"The box misses the object: {100 * missed.mean():.0f} % of the masks lie beside it "
+            f"({100 * missed[worst]:.0f} % in {seen[worst].name}); --box {low} {high} would hold "
+            "it."
+        )
     directions = np.stack([s.camera.center - box.mean(axis=0) for s in silhouettes])
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
     if np.linalg.norm(directions.mean(axis=0)) > 0.8:
@@ -139,9 +157,11 @@ def _disagreement(seen: list[Thumbnail], agreeing: np.ndarray, to_scene: np.ndar
     if misreading:
         return f"The cameras look misread: the masks agree only if {misreading}."
     bad = [t for t, share in zip(seen, agreeing, strict=True) if share < 0.7]
-    return (f"The masks do not agree on a common volume ({100 * agreeing.mean():.0f} % of their pixels do)"
-            f"{': worst are ' + _names(bad) if bad else ''}; check the cameras' convention, the masks and "
-            f"the order of the images.")
+    return (
+        f"The masks do not agree on a common volume ({100 * agreeing.mean():.0f} % of their pixels do)"
+        f"{': worst are ' + _names(bad) if bad else ''}; check the cameras' convention, the masks and "
+        f"the order of the images."
+    )
 
 
 def _share_outside(silhouette: Silhouette, box: np.ndarray) -> float:

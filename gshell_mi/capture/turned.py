@@ -40,21 +40,26 @@ def with_turned_masks(capture: Capture, white: float, inverted: bool) -> tuple[C
     if not open_:
         return capture, []
     training = capture.training
-    some = training[::max(-(-len(training) // _MOST), 1)]
+    some = training[:: max(-(-len(training) // _MOST), 1)]
     marked = {frame.image for frame in open_}
-    readings = [[replace(frame, turned=turned and frame.image in marked) for frame in some]
-                for turned in (False, True)]
+    readings = [
+        [replace(frame, turned=turned and frame.image in marked) for frame in some]
+        for turned in (False, True)
+    ]
     stored, turned = (_agreement(frames, white, inverted) for frames in readings)
     who = f"{counted(len(open_), 'photograph')} such as {open_[0].image.name}"
     if turned > max(_AGREE, stored + _BETTER):
         frames = tuple(replace(frame, turned=frame.image in marked) for frame in capture.frames)
         return replace(capture, frames=frames), [
             f"{who} carry an EXIF orientation, which their masks follow, but not their pixels: the masks are "
-            f"turned back."]
+            f"turned back."
+        ]
     if stored > max(_AGREE, turned + _BETTER):
         return capture, []
-    return capture, [f"{who} carry an EXIF orientation: their masks must be stored as their pixels are, not "
-                     f"as viewers turn them."]
+    return capture, [
+        f"{who} carry an EXIF orientation: their masks must be stored as their pixels are, not "
+        f"as viewers turn them."
+    ]
 
 
 def _is_open(frame: Frame) -> bool:
@@ -69,7 +74,7 @@ def _agreement(frames: list[Frame], white: float, inverted: bool) -> float:
         if frame.mask is None:
             continue
         alpha = match_frame(mask_values(frame.mask), frame, (frame.camera.height, frame.camera.width), 1)
-        if alpha is None:    # which is told when the target is made
+        if alpha is None:  # which is told when the target is made
             continue
         alpha = stretched(alpha, white)
         small, camera = shrink((1 - alpha if inverted else alpha)[..., None], frame.camera, MASK_SIZE)

@@ -71,8 +71,13 @@ def choose(sharpness: np.ndarray, change: np.ndarray, count: int) -> np.ndarray:
     # Where the camera rests there is nothing new; a floor keeps a still video from being cut at random.
     travelled = np.cumsum(np.maximum(change, 1e-3 * max(change.max(), 1e-9)))
     stretch = np.minimum((travelled / travelled[-1] * count * (1 - 1e-9)).astype(int), count - 1)
-    return np.array([members[sharpness[members].argmax()]
-                     for members in (np.flatnonzero(stretch == k) for k in range(count)) if len(members)])
+    return np.array(
+        [
+            members[sharpness[members].argmax()]
+            for members in (np.flatnonzero(stretch == k) for k in range(count))
+            if len(members)
+        ]
+    )
 
 
 def _frames(video: Path, pixels: str, options: list[str]) -> Generator[Any, None, None]:
@@ -86,10 +91,13 @@ def _frames(video: Path, pixels: str, options: list[str]) -> Generator[Any, None
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     try:
         # As it is, ffmpeg would take a name for an address or a list.
-        yield from imageio_ffmpeg.read_frames(f"file:{video.absolute()}", pix_fmt=pixels,
-                                              input_params=["-format_whitelist", _CONTAINERS],
-                                              output_params=options,
-                                              bits_per_pixel=8 if pixels == "gray" else 24)
+        yield from imageio_ffmpeg.read_frames(
+            f"file:{video.absolute()}",
+            pix_fmt=pixels,
+            input_params=["-format_whitelist", _CONTAINERS],
+            output_params=options,
+            bits_per_pixel=8 if pixels == "gray" else 24,
+        )
     except (OSError, RuntimeError, KeyError, IndexError) as error:
         reason = ([line for line in str(error).splitlines() if line.strip()] or [repr(error)])[-1].strip()
         raise UserError(f"Video '{video}' cannot be read ({reason}); convert it to MP4 again.") from error

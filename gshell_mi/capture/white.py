@@ -31,14 +31,20 @@ def white_of(frames: Sequence[Frame]) -> float:
     Raises:
         UserError: a file cannot be read.
     """
-    return _common_white(lambda frame: mask_values(frame.mask) if frame.mask is not None
-                         else alpha_values(read_pixels(frame.image)), frames)
+    return _common_white(
+        lambda frame: (
+            mask_values(frame.mask) if frame.mask is not None else alpha_values(read_pixels(frame.image))
+        ),
+        frames,
+    )
 
 
 def ignored_white_of(frames: Sequence[Frame]) -> float:
     """The same for what ignore masks cover."""
-    return _common_white(lambda frame: mask_values(frame.ignored) if frame.ignored is not None else None,
-                         [frame for frame in frames if frame.ignored is not None])
+    return _common_white(
+        lambda frame: mask_values(frame.ignored) if frame.ignored is not None else None,
+        [frame for frame in frames if frame.ignored is not None],
+    )
 
 
 def _common_white(read: Callable[[Frame], np.ndarray | None], frames: Sequence[Frame]) -> float:
@@ -66,5 +72,7 @@ def _common_white(read: Callable[[Frame], np.ndarray | None], frames: Sequence[F
 def _numbers_parts(values: np.ndarray) -> bool:
     """Whether values in [0, 1] are whole numbers up to ``_MOST_PARTS`` in a file of 8 or 16 bits."""
     numbers = (scale * np.unique(values) for scale in (255, 65535))
-    return any(each[-1] < _MOST_PARTS + 0.5 and np.allclose(each, each.round(), rtol=0, atol=1e-3)
-               for each in numbers)
+    return any(
+        each[-1] < _MOST_PARTS + 0.5 and np.allclose(each, each.round(), rtol=0, atol=1e-3)
+        for each in numbers
+    )

@@ -31,8 +31,10 @@ class Workspace:
     def __init__(self, path: Path):
         self.path = path
         if path.exists() and not is_own_file(path / _MARK) and (not path.is_dir() or any(path.iterdir())):
-            raise UserError(f"'{path}', where the steps before a scene are kept, was not made by "
-                            f"gshell_mi.capture; move it away or choose another output.")
+            raise UserError(
+                f"'{path}', where the steps before a scene are kept, was not made by "
+                f"gshell_mi.capture; move it away or choose another output."
+            )
 
     def step(self, name: str, job: dict) -> Path:
         """The folder of a step; empty if it was last used for another job.
@@ -55,8 +57,10 @@ class Workspace:
             with replacing(folder / "job.json") as partial:
                 partial.write_text(text, encoding="utf-8")
         except OSError as error:
-            raise UserError(f"'{folder}' cannot be written ({error.strerror or error}); free some space, "
-                            f"mend its permissions or choose another output.") from error
+            raise UserError(
+                f"'{folder}' cannot be written ({error.strerror or error}); free some space, "
+                f"mend its permissions or choose another output."
+            ) from error
         return folder
 
 

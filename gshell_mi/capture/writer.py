@@ -78,8 +78,10 @@ def scene_xml(stem: str, box: np.ndarray, resolution: int, light: str | None) ->
     if light is None:
         emitter = '<emitter type="constant" id="light"> <rgb name="radiance" value="0.5"/> </emitter>'
     else:
-        emitter = (f'<emitter type="envmap" id="light"> <string name="filename" value={quoteattr(light)}/> '
-                   f'</emitter>')
+        emitter = (
+            f'<emitter type="envmap" id="light"> <string name="filename" value={quoteattr(light)}/> '
+            f"</emitter>"
+        )
     return f"""<scene version="3.0.0">
     <default name="spp" value="16"/>
     <!-- The unknown: to_world maps the cube [-1, 1]^3 to the box that holds the object. -->

@@ -47,8 +47,9 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return run_command("compare", "Score images, a fit or a mesh against a reference.", _Arguments, _score,
-                       arguments)
+    return run_command(
+        "compare", "Score images, a fit or a mesh against a reference.", _Arguments, _score, arguments
+    )
 
 
 def _score(given: _Arguments) -> None:
@@ -59,13 +60,18 @@ def _score(given: _Arguments) -> None:
         if given.json:
             write_scores(given.json, result)
     except OSError as error:
-        raise UserError(f"'{error.filename or given.output}' cannot be written "
-                        f"({error.strerror or error}); choose another place.") from error
+        raise UserError(
+            f"'{error.filename or given.output}' cannot be written "
+            f"({error.strerror or error}); choose another place."
+        ) from error
     unmatched = result.get("unmatched")
     if unmatched:
         some = ", ".join(unmatched[:3]) + (" ..." if len(unmatched) > 3 else "")
-        print(f"warning: {counted(len(unmatched), 'image')} without a partner of the same name not compared: "
-              f"{some}.", file=sys.stderr)
+        print(
+            f"warning: {counted(len(unmatched), 'image')} without a partner of the same name not compared: "
+            f"{some}.",
+            file=sys.stderr,
+        )
     _show(result)
 
 
@@ -83,8 +89,15 @@ def _compare(given: _Arguments) -> dict:
             raise UserError("--sensors names other views than the fit's; give their images with --targets.")
         if given.envmap and not given.targets:
             raise UserError("--envmap relights the fit; give the images under that light with --targets.")
-        return compare_fit(given.first, targets=given.targets, sensors=given.sensors, envmap=given.envmap,
-                           mesh=given.mesh, spp=given.spp, errors=given.output)
+        return compare_fit(
+            given.first,
+            targets=given.targets,
+            sensors=given.sensors,
+            envmap=given.envmap,
+            mesh=given.mesh,
+            spp=given.spp,
+            errors=given.output,
+        )
     for name in ("targets", "sensors", "envmap", "mesh"):
         if getattr(given, name):
             raise UserError(f"--{name} is for fits only; leave it out, or leave out '{given.second}'.")
@@ -120,9 +133,14 @@ def _show(result: dict) -> None:
 
 
 def _row(scores: Scores) -> list[str]:
-    return ["–" if (score := scores[name]) is None else
-            f"{score:.2f}" if name in ("psnr", "psnr_inside", "delta_e") else f"{score:.4f}"
-            for name in IMAGE_SCORES]
+    return [
+        "–"
+        if (score := scores[name]) is None
+        else f"{score:.2f}"
+        if name in ("psnr", "psnr_inside", "delta_e")
+        else f"{score:.4f}"
+        for name in IMAGE_SCORES
+    ]
 
 
 if __name__ == "__main__":

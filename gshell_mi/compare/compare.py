@@ -51,9 +51,17 @@ def compare_meshes(first: Path, second: Path) -> dict:
     return {"mesh": mesh_scores(read_mesh(first), read_mesh(second))}
 
 
-def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | None = None,
-                envmap: Path | None = None, mesh: Path | None = None, spp: int = 64,
-                errors: Path | None = None, progress: Report | None = None) -> dict:
+def compare_fit(
+    folder: Path,
+    *,
+    targets: Path | None = None,
+    sensors: Path | None = None,
+    envmap: Path | None = None,
+    mesh: Path | None = None,
+    spp: int = 64,
+    errors: Path | None = None,
+    progress: Report | None = None,
+) -> dict:
     """Renders a fit and scores it.
 
     Args:
@@ -83,8 +91,9 @@ def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | No
     _check_free(errors, [camera.id() for camera in cameras])
     width, height = np.max([camera.film().crop_size() for camera in cameras], axis=0)
     memory.require_for_image(int(width), int(height), spp, "A view", "lower --spp")
-    references = [load_target(targets / f"{camera.id()}.exr", *camera.film().crop_size()).rgba
-                  for camera in cameras]
+    references = [
+        load_target(targets / f"{camera.id()}.exr", *camera.film().crop_size()).rgba for camera in cameras
+    ]
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
     images = []
     for number, camera in enumerate(cameras):
@@ -95,14 +104,18 @@ def compare_fit(folder: Path, *, targets: Path | None = None, sensors: Path | No
         if progress:
             progress(number + 1, len(cameras))
     names = [camera.id() for camera in cameras]
-    views = {name: _score(name, image, reference, errors)
-             for name, image, reference in zip(names, images, references, strict=True)}
+    views = {
+        name: _score(name, image, reference, errors)
+        for name, image, reference in zip(names, images, references, strict=True)
+    }
     result = {"views": views, "mean": mean_scores(views.values())}
     if envmap:
         scale = albedo_scale(images, references)
         factors = np.append(scale, 1.0)
-        scaled = {name: image_scores(image * factors, reference)[0]
-                  for name, image, reference in zip(names, images, references, strict=True)}
+        scaled = {
+            name: image_scores(image * factors, reference)[0]
+            for name, image, reference in zip(names, images, references, strict=True)
+        }
         result |= {"mean_albedo_scaled": mean_scores(scaled.values()), "albedo_scale": scale.tolist()}
     if mesh:
         result |= compare_meshes(folder / "mesh.ply", mesh)
@@ -113,8 +126,10 @@ def _recorded_targets(folder: Path) -> Path:
     try:
         return Path(read_json_object(folder / "metrics.json")["targets"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"'{folder / 'metrics.json'}' does not tell where the targets are; name their folder "
-                        f"with --targets.") from error
+        raise UserError(
+            f"'{folder / 'metrics.json'}' does not tell where the targets are; name their folder "
+            f"with --targets."
+        ) from error
 
 
 def _pairs(first: Path, second: Path) -> tuple[dict[str, tuple[Path, Path]], list[str]]:
@@ -126,8 +141,10 @@ def _pairs(first: Path, second: Path) -> tuple[dict[str, tuple[Path, Path]], lis
         raise UserError(f"'{first}' and '{second}' are a folder and a file; give two of a kind.")
     if not first.is_dir():
         return {first.stem: (first, second)}, []
-    ours, theirs = ({path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".exr"}
-                    for folder in (first, second))
+    ours, theirs = (
+        {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".exr"}
+        for folder in (first, second)
+    )
     names = sorted(ours.keys() & theirs.keys())
     if not names:
         raise UserError(f"'{first}' and '{second}' have no EXR files of the same name; rename them in pairs.")
@@ -142,8 +159,11 @@ def _score(name: str, image: np.ndarray, reference: np.ndarray, errors: Path | N
         raise UserError(f"'{name}': {error}") from error
     if errors:
         errors.mkdir(parents=True, exist_ok=True)
-        write_png(errors / f"{name}.png", np.concatenate([over_white(reference), over_white(image), flip], 1),
-                  comment=TAG)
+        write_png(
+            errors / f"{name}.png",
+            np.concatenate([over_white(reference), over_white(image), flip], 1),
+            comment=TAG,
+        )
     return scores
 
 
@@ -151,6 +171,7 @@ def _check_free(errors: Path | None, names: Iterable[str]) -> None:
     """Refuses names that are no files', and files of somebody else where error images would be."""
     for name in names if errors else ():
         if trouble := name_trouble(name, in_scene=False):
-            raise UserError(f"The name '{name[:80]}' {trouble}, so no error image can have it; rename it or "
-                            f"leave out -o.")
+            raise UserError(
+                f"The name '{name[:80]}' {trouble}, so no error image can have it; rename it or leave out -o."
+            )
         check_own_file(Path(errors or ".") / f"{name}.png")

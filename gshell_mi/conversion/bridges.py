@@ -44,7 +44,7 @@ def bridges(mesh: trimesh.Trimesh, feet: Feet, edges: np.ndarray, reach: float) 
     graph = coo_array((mesh.edges_unique_length, (a, b)), shape=(len(mesh.vertices),) * 2).tocsr()
     way = np.empty((len(edges), 3))
     for start in range(0, len(source), _SOURCES):
-        found = dijkstra(graph, directed=False, indices=source[start:start + _SOURCES], limit=limit.max())
+        found = dijkstra(graph, directed=False, indices=source[start : start + _SOURCES], limit=limit.max())
         here = (row >= start) & (row < start + _SOURCES)
         way[here] = found[row[here] - start, corners[edges[here, 1]].T].T
     way = to_corner[edges[:, 0], first] + (way + to_corner[edges[:, 1]]).min(axis=1)

@@ -104,8 +104,10 @@ def _united(mesh: trimesh.Trimesh, lattice: Lattice, winding: np.ndarray, name: 
 
 def _with_surface(sdf: np.ndarray, lattice: Lattice, name: str) -> LatticeFields:
     if not np.isfinite(sdf).all() or not (sdf < 0).any():
-        raise UserError(f"{name}: leaves no surface on a lattice with cells of {lattice.spacing:.3g}, "
-                        f"as it is too small or thin; raise the resolution, or lessen to_world")
+        raise UserError(
+            f"{name}: leaves no surface on a lattice with cells of {lattice.spacing:.3g}, "
+            f"as it is too small or thin; raise the resolution, or lessen to_world"
+        )
     return LatticeFields.closed(sdf, lattice.grid)
 
 
@@ -117,7 +119,16 @@ def _far_distance(lattice: Lattice, points: np.ndarray, band: np.ndarray, feet: 
     shape = (lattice.stride,) * 3
     foot = np.zeros((lattice.vertex_count, 3))
     foot[band] = feet.point
-    nearest = [grid.first + np.ravel_multi_index(tuple(ndimage.distance_transform_edt(
-        away[grid.ids].reshape(shape), return_distances=False, return_indices=True)), shape).ravel()
-        for grid in lattice.grids]
+    nearest = [
+        grid.first
+        + np.ravel_multi_index(
+            tuple(
+                ndimage.distance_transform_edt(
+                    away[grid.ids].reshape(shape), return_distances=False, return_indices=True
+                )
+            ),
+            shape,
+        ).ravel()
+        for grid in lattice.grids
+    ]
     return np.linalg.norm(points - foot[np.concatenate(nearest)], axis=1)

@@ -60,8 +60,12 @@ def _bubbles(sdf: np.ndarray, lattice: Lattice, band: np.ndarray) -> np.ndarray:
     """Vertices that few others of their sign hang together with: they tell no layers apart."""
     slot = np.full(lattice.vertex_count, -1)
     slot[band] = np.arange(len(band))
-    pairs = np.concatenate([np.stack([band, x.numpy().astype(int)], axis=1)
-                            for x in lattice.neighbours(mi.UInt32(band.astype(np.uint32)))])
+    pairs = np.concatenate(
+        [
+            np.stack([band, x.numpy().astype(int)], axis=1)
+            for x in lattice.neighbours(mi.UInt32(band.astype(np.uint32)))
+        ]
+    )
     pairs = slot[pairs[(sdf[pairs[:, 0]] < 0) == (sdf[pairs[:, 1]] < 0)]]
     piece = vertex_components(pairs[pairs[:, 1] >= 0], len(band))[1]
     return band[np.bincount(piece)[piece] <= _BUBBLE]

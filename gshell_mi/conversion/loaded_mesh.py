@@ -14,8 +14,9 @@ from .orientation import oriented
 _DECIMALS = 6
 
 
-def loaded_mesh(source: str | Path | trimesh.Trimesh, name: str,
-                to_world: np.ndarray | None = None) -> trimesh.Trimesh:
+def loaded_mesh(
+    source: str | Path | trimesh.Trimesh, name: str, to_world: np.ndarray | None = None
+) -> trimesh.Trimesh:
     """The mesh of a file, or a copy, in lattice units.
 
     It is welded, has no repeated faces, whichever way they face, no degenerate ones and no pinches; its
@@ -32,8 +33,9 @@ def loaded_mesh(source: str | Path | trimesh.Trimesh, name: str,
     """
     try:
         if isinstance(source, trimesh.Trimesh):
-            vertices, faces = check_triangles(np.asarray(source.vertices, float),
-                                              np.asarray(source.faces, np.int64))
+            vertices, faces = check_triangles(
+                np.asarray(source.vertices, float), np.asarray(source.faces, np.int64)
+            )
         else:
             vertices, faces = read_triangles(source)
     except ValueError as error:
@@ -64,6 +66,7 @@ def without_pinches(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     _, first, edge = np.unique(np.sort(ends, axis=1), axis=0, return_index=True, return_inverse=True)
     # Faces that share an edge share its ends.
     same = np.stack([side, side[first[edge.reshape(-1)]]], axis=-1).reshape(-1, 2)
-    _, chosen, faces = np.unique(vertex_components(same, corner.size)[1], return_index=True,
-                                 return_inverse=True)
+    _, chosen, faces = np.unique(
+        vertex_components(same, corner.size)[1], return_index=True, return_inverse=True
+    )
     return trimesh.Trimesh(mesh.vertices[mesh.faces.ravel()[chosen]], faces.reshape(-1, 3), process=False)

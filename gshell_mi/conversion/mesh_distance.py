@@ -32,8 +32,9 @@ def nearest_faces(mesh: trimesh.Trimesh, lattice: Lattice, reach: float) -> tupl
     return vertex, (found[vertex] & 0xFFFFFFFF).astype(np.int64)
 
 
-def _find_nearest(best: UInt64, triangles: np.ndarray, lattice: Lattice, grid: CubicGrid,
-                  reach: float) -> None:
+def _find_nearest(
+    best: UInt64, triangles: np.ndarray, lattice: Lattice, grid: CubicGrid, reach: float
+) -> None:
     """Lowers ``best``, at the vertices of one grid, to the squared distance and the number of a triangle."""
     import mitsuba as mi
 

@@ -8,8 +8,13 @@ from scipy.spatial import cKDTree
 
 
 def necks(
-    vertices: np.ndarray, edges: np.ndarray, positive: np.ndarray, border: np.ndarray, loop: np.ndarray,
-    rim: np.ndarray, reach: float
+    vertices: np.ndarray,
+    edges: np.ndarray,
+    positive: np.ndarray,
+    border: np.ndarray,
+    loop: np.ndarray,
+    rim: np.ndarray,
+    reach: float,
 ) -> np.ndarray:
     """The vertices of a template that have to be cut, so that no rim of a mesh becomes several loops.
 
@@ -49,8 +54,9 @@ def necks(
     cut = np.zeros(len(vertices) + len(rim_of), bool)
     for one in torn:
         mine = len(vertices) + np.flatnonzero(rim_of == one)
-        way, before, source = dijkstra(graph, directed=False, indices=mine, limit=reach, min_only=True,
-                                       return_predecessors=True)
+        way, before, source = dijkstra(
+            graph, directed=False, indices=mine, limit=reach, min_only=True, return_predecessors=True
+        )
         whole = way[a] + length + way[b]
         meeting = np.flatnonzero((whole <= reach) & (source[a] != source[b]))
         joined = DisjointSet(mine.tolist())
@@ -60,4 +66,4 @@ def necks(
                     while vertex >= 0:
                         cut[vertex] = True
                         vertex = before[vertex]
-    return np.flatnonzero(cut[:len(vertices)])
+    return np.flatnonzero(cut[: len(vertices)])

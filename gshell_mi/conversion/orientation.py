@@ -19,17 +19,19 @@ def oriented(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     inverse = inverse.reshape(-1)
     order = np.argsort(inverse, kind="stable")
     pair = order[uses[inverse[order]] == 2].reshape(-1, 2)
-    first, second = (pair // 3).T    # the sides of face f are 3 f to 3 f + 2
+    first, second = (pair // 3).T  # the sides of face f are 3 f to 3 f + 2
     agree = (mesh.edges[pair[:, 0]] == mesh.edges[pair[:, 1]][:, ::-1]).all(axis=1)
     flip = _flips(len(mesh.faces), mesh.area_faces, first, second, agree)
     faces = np.where(flip[:, None], mesh.faces[:, ::-1], mesh.faces)
     piece = vertex_components(np.stack([first, second], axis=1), len(faces))[1]
-    return trimesh.Trimesh(mesh.vertices, _outwards(mesh.vertices, faces, piece, inverse, uses),
-                           process=False)
+    return trimesh.Trimesh(
+        mesh.vertices, _outwards(mesh.vertices, faces, piece, inverse, uses), process=False
+    )
 
 
-def _flips(count: int, area: np.ndarray, first: np.ndarray, second: np.ndarray,
-           agree: np.ndarray) -> np.ndarray:
+def _flips(
+    count: int, area: np.ndarray, first: np.ndarray, second: np.ndarray, agree: np.ndarray
+) -> np.ndarray:
     """(F,) which faces to turn so that each pair of neighbours agrees, where that is possible.
 
     Each face is there twice, as it is and turned; neighbours that agree join the like ones.
@@ -42,11 +44,12 @@ def _flips(count: int, area: np.ndarray, first: np.ndarray, second: np.ndarray,
     kept, turned = label[:count], label[count:]
     weight = np.bincount(kept, area, kinds)
     flip = (weight[kept] < weight[turned]) | ((weight[kept] == weight[turned]) & (kept > turned))
-    for one in np.unique(kept[kept == turned]):    # not orientable: along a tree, which leaves one seam
+    for one in np.unique(kept[kept == turned]):  # not orientable: along a tree, which leaves one seam
         members = np.flatnonzero(kept == one)
         inside = kept[first] == one
-        graph = coo_array((np.where(agree, 1, 2)[inside], (first[inside], second[inside])),
-                          (count, count)).tocsr()
+        graph = coo_array(
+            (np.where(agree, 1, 2)[inside], (first[inside], second[inside])), (count, count)
+        ).tocsr()
         row, before = breadth_first_order(graph, members[0], directed=False)
         both = graph + graph.T
         flip[members] = False
@@ -56,8 +59,9 @@ def _flips(count: int, area: np.ndarray, first: np.ndarray, second: np.ndarray,
     return flip
 
 
-def _outwards(vertices: np.ndarray, faces: np.ndarray, piece: np.ndarray, edge_of_side: np.ndarray,
-              uses: np.ndarray) -> np.ndarray:
+def _outwards(
+    vertices: np.ndarray, faces: np.ndarray, piece: np.ndarray, edge_of_side: np.ndarray, uses: np.ndarray
+) -> np.ndarray:
     """The faces, with closed pieces turned that enclose a negative volume and are no hollows."""
     rim = (uses[edge_of_side] != 2).reshape(-1, 3).any(axis=1)
     count = piece.max() + 1
@@ -65,9 +69,10 @@ def _outwards(vertices: np.ndarray, faces: np.ndarray, piece: np.ndarray, edge_o
     corners = vertices[faces]
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     corners = corners - (low + high) / 2
-    volume = np.bincount(piece, np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])),
-                         count)
-    if closed.all() and volume.sum() < 0:    # hollows included
+    volume = np.bincount(
+        piece, np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])), count
+    )
+    if closed.all() and volume.sum() < 0:  # hollows included
         faces, volume = faces[:, ::-1], -volume
     inside_out = np.flatnonzero(closed & (volume < 0))
     if len(inside_out) == 0:
@@ -88,6 +93,10 @@ def _is_hollow(vertices: np.ndarray, others: np.ndarray, point: np.ndarray) -> b
     la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
     # Van Oosterom and Strackee 1983.
     numerator = np.einsum("ij,ij->i", a, np.cross(b, c))
-    denominator = (la * lb * lc + np.einsum("ij,ij->i", a, b) * lc + np.einsum("ij,ij->i", b, c) * la
-                   + np.einsum("ij,ij->i", c, a) * lb)
+    denominator = (
+        la * lb * lc
+        + np.einsum("ij,ij->i", a, b) * lc
+        + np.einsum("ij,ij->i", b, c) * la
+        + np.einsum("ij,ij->i", c, a) * lb
+    )
     return bool(abs(np.arctan2(numerator, denominator).sum()) > np.pi)

@@ -79,8 +79,15 @@ def rim_cut(
         neck = np.zeros(0, int)
         if settled or turn >= _SIGN_ROUNDS / 2:
             border, of_loop = _loops(extract(lattice, mi.Float(fields.sdf), mi.Float(at_lattice(values))))
-            neck = necks(vertices, edges, found > 0, border, of_loop, loop[rims.query(border)[1]],
-                         _NECK_CELLS * lattice.spacing)
+            neck = necks(
+                vertices,
+                edges,
+                found > 0,
+                border,
+                of_loop,
+                loop[rims.query(border)[1]],
+                _NECK_CELLS * lattice.spacing,
+            )
             cut[neck], wanted[neck] = True, -0.25 * lattice.spacing
         if settled and not len(neck):
             break
@@ -108,8 +115,14 @@ def _loops(surface: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rim_distance(
-    vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, edges: np.ndarray, lattice: Lattice,
-    feet_of: MeshFeet, nearest: np.ndarray, rims: cKDTree,
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    faces: np.ndarray,
+    edges: np.ndarray,
+    lattice: Lattice,
+    feet_of: MeshFeet,
+    nearest: np.ndarray,
+    rims: cKDTree,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Signed distance to the rims along the mesh at the vertices of the template, which of these are near
     a rim, and which are cut as they lead from one layer to another."""

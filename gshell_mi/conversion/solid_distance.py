@@ -20,8 +20,9 @@ _BAND = 2.5
 _SOLID_BAND = 1.2
 
 
-def solid_distance(vertices: np.ndarray, faces: np.ndarray, solid: np.ndarray,
-                   lattice: Lattice) -> np.ndarray:
+def solid_distance(
+    vertices: np.ndarray, faces: np.ndarray, solid: np.ndarray, lattice: Lattice
+) -> np.ndarray:
     """Signed distance to a watertight mesh; inside thin parts, to the side that is solid.
 
     A lattice has but one vertex between the two sides of a thin part, whose value can place only one of them

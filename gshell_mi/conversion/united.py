@@ -15,8 +15,11 @@ def winding_at(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     """(n,) generalised winding numbers of a mesh at points (n, 3)."""
     from gpytoolbox import fast_winding_number  # takes a second to import
 
-    return fast_winding_number(np.ascontiguousarray(points, float), np.asarray(mesh.vertices, float),
-                               np.asarray(mesh.faces, np.int32))
+    return fast_winding_number(
+        np.ascontiguousarray(points, float),
+        np.asarray(mesh.vertices, float),
+        np.asarray(mesh.faces, np.int32),
+    )
 
 
 def visible_part(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
@@ -53,5 +56,6 @@ def _hidden(mesh: trimesh.Trimesh, triangles: np.ndarray, cell: float) -> np.nda
 def _quartered(triangles: np.ndarray) -> np.ndarray:
     a, b, c = np.moveaxis(triangles, 1, 0)
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    return np.concatenate([np.stack(corners, axis=1) for corners in
-                           ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    return np.concatenate(
+        [np.stack(corners, axis=1) for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    )

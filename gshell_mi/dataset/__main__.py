@@ -42,9 +42,14 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return run_command("dataset", "Make a data set of open surfaces.", _Arguments, _make, arguments,
-                       interrupted=lambda given: f"Interrupted; run the same command again to go on with "
-                                                 f"'{given.output}'.")
+    return run_command(
+        "dataset",
+        "Make a data set of open surfaces.",
+        _Arguments,
+        _make,
+        arguments,
+        interrupted=lambda given: f"Interrupted; run the same command again to go on with '{given.output}'.",
+    )
 
 
 def _make(given: _Arguments) -> None:
@@ -57,8 +62,9 @@ def _make(given: _Arguments) -> None:
     if given.output is None:
         raise UserError("Nothing says where the data set goes; name a folder with -o.")
     if given.garments < 0 or not (given.sources or given.garments):
-        raise UserError("There is nothing to make a data set of; name folders of meshes, or a number of "
-                        "--garments.")
+        raise UserError(
+            "There is nothing to make a data set of; name folders of meshes, or a number of --garments."
+        )
     if given.garments > _MOST_GARMENTS:
         raise UserError(f"--garments must be at most {_MOST_GARMENTS}, not {given.garments}.")
     check_positive("--max-chamfer", given.max_chamfer)
@@ -68,9 +74,18 @@ def _make(given: _Arguments) -> None:
         raise UserError(f"--held-out must be at least 0 and less than 1, not {given.held_out:g}.")
     if given.processes < 1:
         raise UserError(f"--processes must be at least 1, not {given.processes}.")
-    told = make_data_set(given.output, list(given.sources), garments=given.garments, seed=given.seed,
-                         side=given.side, held_out=given.held_out, most=given.max_chamfer,
-                         processes=given.processes, variant=given.variant, quiet=given.quiet)
+    told = make_data_set(
+        given.output,
+        list(given.sources),
+        garments=given.garments,
+        seed=given.seed,
+        side=given.side,
+        held_out=given.held_out,
+        most=given.max_chamfer,
+        processes=given.processes,
+        variant=given.variant,
+        quiet=given.quiet,
+    )
     print(told)
 
 

@@ -12,5 +12,14 @@ from .image_scores import (
 from .mesh_scores import mesh_scores
 from .relighting import albedo_scale
 
-__all__ = ["IMAGE_SCORES", "VIEW_SCORES", "Scores", "albedo_scale", "image_scores", "mean_scores",
-           "mesh_scores", "read_image", "view_scores"]
+__all__ = [
+    "IMAGE_SCORES",
+    "VIEW_SCORES",
+    "Scores",
+    "albedo_scale",
+    "image_scores",
+    "mean_scores",
+    "mesh_scores",
+    "read_image",
+    "view_scores",
+]

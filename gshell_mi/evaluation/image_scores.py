@@ -69,8 +69,10 @@ def image_scores(image: np.ndarray, reference: np.ndarray) -> tuple[Scores, np.n
         UserError: the sizes differ or are below 7 pixels.
     """
     if image.shape != reference.shape:
-        raise UserError(f"The images are {_size(image)} and {_size(reference)} pixels; only images of one "
-                        f"size can be compared.")
+        raise UserError(
+            f"The images are {_size(image)} and {_size(reference)} pixels; only images of one "
+            f"size can be compared."
+        )
     if min(image.shape[:2]) < _SSIM_WINDOW:
         raise UserError(f"The images are {_size(image)} pixels; SSIM needs {_SSIM_WINDOW} at least per side.")
     left, right = over_white(image), over_white(reference)
@@ -108,13 +110,15 @@ def view_scores(image: np.ndarray, target: Target) -> Scores:
     return scores if target.has_alpha else scores | {"mask_iou": None}
 
 
-def _scores(left: np.ndarray, right: np.ndarray, first: np.ndarray,
-            second: np.ndarray) -> tuple[dict[str, float | None], np.ndarray]:
+def _scores(
+    left: np.ndarray, right: np.ndarray, first: np.ndarray, second: np.ndarray
+) -> tuple[dict[str, float | None], np.ndarray]:
     """``VIEW_SCORES`` of (h, w, 3) sRGB images and their (h, w) masks; and the FLIP map."""
     import flip_evaluator
 
-    flip_map, flip, _ = flip_evaluator.evaluate(right.astype(np.float32), left.astype(np.float32), "LDR",
-                                                applyMagma=True)
+    flip_map, flip, _ = flip_evaluator.evaluate(
+        right.astype(np.float32), left.astype(np.float32), "LDR", applyMagma=True
+    )
     both, union = first & second, np.count_nonzero(first | second)
     similarity: Any = None
     if min(left.shape[:2]) >= _SSIM_WINDOW:

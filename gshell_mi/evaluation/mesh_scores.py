@@ -36,8 +36,9 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def mesh_scores(mesh: trimesh.Trimesh, reference: trimesh.Trimesh, samples: int = 200_000,
-                seed: int = 0) -> dict:
+def mesh_scores(
+    mesh: trimesh.Trimesh, reference: trimesh.Trimesh, samples: int = 200_000, seed: int = 0
+) -> dict:
     """Distances in per cent of the reference's bounding box diagonal, and counts.
 
     ``chamfer`` is the mean of ``accuracy`` (from the mesh to the reference) and ``completeness`` (back), over
@@ -48,8 +49,9 @@ def mesh_scores(mesh: trimesh.Trimesh, reference: trimesh.Trimesh, samples: int 
     tells orientation and missing parts.
     """
     diagonal = float(np.linalg.norm(reference.extents))
-    (a, face_a), (b, face_b) = (trimesh.sample.sample_surface(m, samples, seed=seed + i)[:2]
-                                for i, m in enumerate((mesh, reference)))
+    (a, face_a), (b, face_b) = (
+        trimesh.sample.sample_surface(m, samples, seed=seed + i)[:2] for i, m in enumerate((mesh, reference))
+    )
     c = trimesh.sample.sample_surface(reference, samples, seed=seed + 2)[0]
     tree_a, tree_b = cKDTree(a), cKDTree(b)
     (accuracy, _), (completeness, nearest), (floor, _) = tree_b.query(a), tree_a.query(b), tree_b.query(c)
@@ -65,8 +67,10 @@ def mesh_scores(mesh: trimesh.Trimesh, reference: trimesh.Trimesh, samples: int 
         "f_score": float(2 * precision * recall / max(precision + recall, 1e-12)),
         "normal_consistency": float(cosine.mean()),
         "winding_difference": _winding_difference(mesh, reference, seed),
-        **{name: {"found": getattr(found, name), "reference": getattr(true, name)}
-           for name in ("boundary_loops", "pinholes", "boundary_length", "components", "nonmanifold_edges")},
+        **{
+            name: {"found": getattr(found, name), "reference": getattr(true, name)}
+            for name in ("boundary_loops", "pinholes", "boundary_length", "components", "nonmanifold_edges")
+        },
     }
 
 

@@ -18,4 +18,4 @@ def albedo_scale(images: list[np.ndarray], references: list[np.ndarray]) -> np.n
     """
     image, reference = (np.stack(stack)[..., :3] for stack in (images, references))
     axes = (0, 1, 2)
-    return (image * reference).sum(axes) / np.maximum((image ** 2).sum(axes), 1e-12)
+    return (image * reference).sum(axes) / np.maximum((image**2).sum(axes), 1e-12)

@@ -27,5 +27,6 @@ def write_scores(path: Path, scores: dict[str, Any]) -> None:
         with replacing(path) as partial:
             partial.write_text(json.dumps({"by": TAG} | scores, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
-        raise UserError(f"'{path}' cannot be written ({error.strerror or error}); choose another place with "
-                        f"--json.") from error
+        raise UserError(
+            f"'{path}' cannot be written ({error.strerror or error}); choose another place with --json."
+        ) from error

@@ -25,8 +25,13 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return run_command("export", "Write the object of a fit for Blender, game engines and simulators.",
-                       _Arguments, _export, arguments)
+    return run_command(
+        "export",
+        "Write the object of a fit for Blender, game engines and simulators.",
+        _Arguments,
+        _export,
+        arguments,
+    )
 
 
 def _export(given: _Arguments) -> None:
@@ -34,8 +39,10 @@ def _export(given: _Arguments) -> None:
     atlas = f"{report['charts']} charts" if report["charts"] else "colours at the vertices, no UV atlas"
     print(f"{given.output / 'mesh.glb'}: {report['faces']} faces, {atlas}")
     if "remeshed_faces" in report:
-        print(f"{given.output / 'remeshed.ply'}: {report['remeshed_faces']} faces, worst quality "
-              f"{report['remeshed_min_quality']:.3f}")
+        print(
+            f"{given.output / 'remeshed.ply'}: {report['remeshed_faces']} faces, worst quality "
+            f"{report['remeshed_min_quality']:.3f}"
+        )
 
 
 if __name__ == "__main__":

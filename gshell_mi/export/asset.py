@@ -23,8 +23,14 @@ from .remesh import edge_length_for, remesh, triangle_quality
 from .stock_scene import up_axis
 
 #: What ``AssetConfig.obj`` adds.
-_OBJ_FILES = ("mesh.obj", "mesh.mtl", "mesh_base_color.png", "mesh_roughness.png", "mesh_metallic.png",
-              "mesh_normal.png")
+_OBJ_FILES = (
+    "mesh.obj",
+    "mesh.mtl",
+    "mesh_base_color.png",
+    "mesh_roughness.png",
+    "mesh_metallic.png",
+    "mesh_normal.png",
+)
 
 #: Bytes that a texel takes: its colour, roughness, metallic and normal, and what they are baked from.
 _PER_TEXEL = 100
@@ -56,11 +62,16 @@ class AssetConfig:
     def __post_init__(self) -> None:
         if self.texture_size < 16:
             raise UserError(f"--texture-size must be at least 16 pixels, not {self.texture_size}.")
-        memory.require(_PER_TEXEL * self.texture_size**2, memory.free_memory(),
-                       f"Textures of {self.texture_size} pixels per side", "lower --texture-size")
+        memory.require(
+            _PER_TEXEL * self.texture_size**2,
+            memory.free_memory(),
+            f"Textures of {self.texture_size} pixels per side",
+            "lower --texture-size",
+        )
         if not 0 <= self.unwrap_seconds < _LONGEST:
-            raise UserError(f"--unwrap-seconds lies between 0 and {_LONGEST}, unlike "
-                            f"{self.unwrap_seconds:g}.")
+            raise UserError(
+                f"--unwrap-seconds lies between 0 and {_LONGEST}, unlike {self.unwrap_seconds:g}."
+            )
         if self.face_count < 0:
             raise UserError(f"--face-count must not be negative, and is {self.face_count}.")
         if not 0 <= self.min_quality < 1:
@@ -85,14 +96,17 @@ def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
     fine = read_ply(folder / "mesh.ply")
     if len(fine.faces) == 0:
         raise UserError(f"'{folder / 'mesh.ply'}' is empty; there is nothing to export.")
-    lacking = [name for name, axes in (("color", 2), ("roughness", 1), ("metallic", 1))
-               if np.ndim(fine.attributes.get(name, 0)) != axes]
+    lacking = [
+        name
+        for name, axes in (("color", 2), ("roughness", 1), ("metallic", 1))
+        if np.ndim(fine.attributes.get(name, 0)) != axes
+    ]
     if lacking:
         raise UserError(f"'{folder / 'mesh.ply'}' has no {lacking[0]}; run the fit again, which writes it.")
     names = ["mesh.glb", *(_OBJ_FILES if config.obj else ())]
     if config.remesh is not None:
         names.append("remeshed.ply")
-    turn = y_up_turn(folder)    # all is read before anything is written
+    turn = y_up_turn(folder)  # all is read before anything is written
     with own_folder(folder, "fit") as own:
         own.claim(*names)
         return _write(folder, fine, turn, config)
@@ -114,13 +128,27 @@ def _write(folder: Path, fine: FittedMesh, turn: np.ndarray, config: AssetConfig
             _write_obj(folder, vertices, normals, faces, atlas.uv, textures)
     else:
         source = project(fine, vertices, normals)
-        color, roughness, metallic = (source.interpolate(fine.faces, fine.attributes[name])
-                                      for name in ("color", "roughness", "metallic"))
-        write_glb(folder / "mesh.glb", [Part("subject", faces, {
-            "POSITION": vertices, "NORMAL": normals, "COLOR_0": np.clip(color, 0, 1)}, {
-            "doubleSided": True, "pbrMetallicRoughness": {
-                "roughnessFactor": float(np.clip(roughness.mean(), 0, 1)),
-                "metallicFactor": float(np.clip(metallic.mean(), 0, 1))}})])
+        color, roughness, metallic = (
+            source.interpolate(fine.faces, fine.attributes[name])
+            for name in ("color", "roughness", "metallic")
+        )
+        write_glb(
+            folder / "mesh.glb",
+            [
+                Part(
+                    "subject",
+                    faces,
+                    {"POSITION": vertices, "NORMAL": normals, "COLOR_0": np.clip(color, 0, 1)},
+                    {
+                        "doubleSided": True,
+                        "pbrMetallicRoughness": {
+                            "roughnessFactor": float(np.clip(roughness.mean(), 0, 1)),
+                            "metallicFactor": float(np.clip(metallic.mean(), 0, 1)),
+                        },
+                    },
+                )
+            ],
+        )
         if config.obj:
             with replacing(folder / "mesh.obj") as partial:
                 trimesh.Trimesh(vertices, faces, process=False).export(partial)
@@ -129,17 +157,33 @@ def _write(folder: Path, fine: FittedMesh, turn: np.ndarray, config: AssetConfig
     return report
 
 
-def textured_part(vertices: np.ndarray, normals: np.ndarray, tangents: np.ndarray, faces: np.ndarray,
-                  uv: np.ndarray, textures: Textures) -> Part:
+def textured_part(
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    tangents: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray,
+    textures: Textures,
+) -> Part:
     """The object as glTF wants it, both sides visible."""
-    attributes = {"POSITION": vertices, "NORMAL": normals, "TANGENT": tangents,
-                  "TEXCOORD_0": np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)}
-    material = {"doubleSided": True, "normalTexture": "normal",
-                "occlusionTexture": "occlusion_roughness_metallic",
-                "pbrMetallicRoughness": {"baseColorTexture": "base_color",
-                                         "metallicRoughnessTexture": "occlusion_roughness_metallic"}}
-    images = {name: getattr(textures, name)
-              for name in ("base_color", "occlusion_roughness_metallic", "normal")}
+    attributes = {
+        "POSITION": vertices,
+        "NORMAL": normals,
+        "TANGENT": tangents,
+        "TEXCOORD_0": np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1),
+    }
+    material = {
+        "doubleSided": True,
+        "normalTexture": "normal",
+        "occlusionTexture": "occlusion_roughness_metallic",
+        "pbrMetallicRoughness": {
+            "baseColorTexture": "base_color",
+            "metallicRoughnessTexture": "occlusion_roughness_metallic",
+        },
+    }
+    images = {
+        name: getattr(textures, name) for name in ("base_color", "occlusion_roughness_metallic", "normal")
+    }
     return Part("subject", faces, attributes, material, images)
 
 
@@ -154,8 +198,9 @@ def _simplified(fine: FittedMesh, face_count: int) -> tuple[np.ndarray, np.ndarr
 
 def _write_remeshed(folder: Path, fine: FittedMesh, config: AssetConfig) -> dict:
     assert config.remesh is not None
-    vertices, faces = remesh(fine.vertices, fine.faces, config.remesh, resample_boundary=True,
-                             min_quality=config.min_quality)
+    vertices, faces = remesh(
+        fine.vertices, fine.faces, config.remesh, resample_boundary=True, min_quality=config.min_quality
+    )
     normals = vertex_normals(vertices, faces)
     source = project(fine, vertices, normals)
     attributes = {name: source.interpolate(fine.faces, values) for name, values in fine.attributes.items()}
@@ -164,19 +209,31 @@ def _write_remeshed(folder: Path, fine: FittedMesh, config: AssetConfig) -> dict
     return {"remeshed_faces": len(faces), "remeshed_min_quality": math.floor(1000 * worst) / 1000}
 
 
-def _write_obj(folder: Path, vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, uv: np.ndarray,
-               textures: Textures) -> None:
+def _write_obj(
+    folder: Path,
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray,
+    textures: Textures,
+) -> None:
     """``mesh.obj`` and ``mesh.mtl`` with the PBR extension of MTL (map_Pr, map_Pm, norm), v upwards."""
     orm = textures.occlusion_roughness_metallic
-    images = {"base_color": textures.base_color, "roughness": orm[..., 1], "metallic": orm[..., 2],
-              "normal": textures.normal}
+    images = {
+        "base_color": textures.base_color,
+        "roughness": orm[..., 1],
+        "metallic": orm[..., 2],
+        "normal": textures.normal,
+    }
     for name, image in images.items():
         with replacing(folder / f"mesh_{name}.png") as partial:
             Image.fromarray(image).save(partial)
     with replacing(folder / "mesh.mtl") as partial:
         partial.write_text(
             "newmtl subject\nKd 1 1 1\nillum 2\nmap_Kd mesh_base_color.png\nmap_Pr mesh_roughness.png\n"
-            "map_Pm mesh_metallic.png\nnorm mesh_normal.png\n", encoding="utf-8")
+            "map_Pm mesh_metallic.png\nnorm mesh_normal.png\n",
+            encoding="utf-8",
+        )
     # Welded: one position per point, or simulators would tear the object along the atlas's seams.
     welded, index = np.unique(vertices, axis=0, return_inverse=True)
     index = index.ravel()
@@ -193,7 +250,7 @@ def _write_obj(folder: Path, vertices: np.ndarray, normals: np.ndarray, faces: n
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V, 3) unit normals; any direction where a vertex has no area."""
     normals = np.array(trimesh.Trimesh(vertices, faces, process=False).vertex_normals)
-    normals[np.abs((normals ** 2).sum(1) - 1) > 1e-3] = [0, 1, 0]  # of vertices without area
+    normals[np.abs((normals**2).sum(1) - 1) > 1e-3] = [0, 1, 0]  # of vertices without area
     return normals
 
 

@@ -32,8 +32,14 @@ class Atlas:
     charts: int
 
 
-def unwrap(vertices: np.ndarray, faces: np.ndarray, *, texture_size: int = 1024, padding: int = 4,
-           seconds: float = 60.0) -> Atlas | None:
+def unwrap(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    texture_size: int = 1024,
+    padding: int = 4,
+    seconds: float = 60.0,
+) -> Atlas | None:
     """Unwraps a mesh without overlaps; None if that fails or takes longer than ``seconds``.
 
     xatlas is given slightly smoothed positions: noise of the surface's normals would scatter it over hundreds
@@ -48,14 +54,23 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, *, texture_size: int = 1024,
     """
     with tempfile.TemporaryDirectory() as folder:
         given, found = Path(folder) / "mesh.npz", Path(folder) / "atlas.npz"
-        np.savez(given, vertices=_with_unit_faces(_smoothed(vertices, faces), len(faces)),
-                 faces=faces.astype(np.uint32), texture_size=texture_size, padding=padding)
+        np.savez(
+            given,
+            vertices=_with_unit_faces(_smoothed(vertices, faces), len(faces)),
+            faces=faces.astype(np.uint32),
+            texture_size=texture_size,
+            padding=padding,
+        )
         command = [sys.executable, str(Path(__file__).with_name("_unwrap.py")), str(given), str(found)]
         try:
             subprocess.run(command, check=True, timeout=seconds, capture_output=True)
             with np.load(found) as arrays:
-                atlas = Atlas(arrays["source"].astype(np.int64), arrays["faces"].astype(np.int64),
-                              arrays["uv"].astype(np.float64), int(arrays["charts"]))
+                atlas = Atlas(
+                    arrays["source"].astype(np.int64),
+                    arrays["faces"].astype(np.int64),
+                    arrays["uv"].astype(np.float64),
+                    int(arrays["charts"]),
+                )
         except (subprocess.SubprocessError, OSError):
             return None
     # What it could not unwrap it leaves at the origin or drops.

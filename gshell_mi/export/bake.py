@@ -46,8 +46,15 @@ class SurfacePoints:
         return np.einsum("nk,nk...->n...", self.weights, corners)
 
 
-def bake(fine: FittedMesh, vertices: np.ndarray, normals: np.ndarray, tangents: np.ndarray,
-         faces: np.ndarray, uv: np.ndarray, size: int) -> Textures:
+def bake(
+    fine: FittedMesh,
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    tangents: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray,
+    size: int,
+) -> Textures:
     """Textures for the mesh ``(vertices, faces)`` with material and normals of ``fine``.
 
     Each texel looks along its normal, to both sides, for the nearest point of the fine mesh that faces the
@@ -66,8 +73,9 @@ def bake(fine: FittedMesh, vertices: np.ndarray, normals: np.ndarray, tangents: 
     source = project(fine, at.interpolate(faces, vertices), normal)
     occlusion = source.interpolate(fine.faces, openness(fine))
     color = source.interpolate(fine.faces, fine.attributes["color"])
-    roughness, metallic = (source.interpolate(fine.faces, fine.attributes[name])
-                           for name in ("roughness", "metallic"))
+    roughness, metallic = (
+        source.interpolate(fine.faces, fine.attributes[name]) for name in ("roughness", "metallic")
+    )
     # Interpolated but not normalised, as renderers do (MikkTSpace).
     tangent = at.interpolate(faces, tangents[:, :3])
     bitangent = at.interpolate(faces, tangents[:, 3:] * np.cross(normals, tangents[:, :3]))
@@ -127,8 +135,9 @@ def openness(mesh: FittedMesh) -> np.ndarray:
     return np.array(dr.block_sum(dr.select(hit, mi.Float(0), mi.Float(1)), _OCCLUSION_RAYS)) / _OCCLUSION_RAYS
 
 
-def vertex_tangents(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray,
-                    uv: np.ndarray) -> np.ndarray:
+def vertex_tangents(
+    vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, uv: np.ndarray
+) -> np.ndarray:
     """(V, 4) unit tangents along u, orthogonal to the normals, with the bitangent's sign: bitangent =
     sign · normal x tangent, as glTF 2.0 defines it."""
     p0, p1, p2 = (vertices[faces[:, i]] for i in range(3))
@@ -142,7 +151,7 @@ def vertex_tangents(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray
         np.add.at(tangents, faces[:, corner], unit(along_u) * np.sqrt(np.abs(determinant))[:, None])
         np.add.at(signs, faces[:, corner], determinant)
     tangents = unit(tangents - (tangents * normals).sum(1, keepdims=True) * normals)
-    lost = np.abs((tangents ** 2).sum(1) - 1) > 1e-3
+    lost = np.abs((tangents**2).sum(1) - 1) > 1e-3
     if lost.any():  # any direction in the tangent plane will do
         axis = np.eye(3)[np.abs(normals[lost]).argmin(1)]
         tangents[lost] = unit(np.cross(normals[lost], axis))
@@ -160,7 +169,8 @@ def _texels(faces: np.ndarray, uv: np.ndarray, size: int) -> tuple[np.ndarray, S
     filled = np.isfinite(np.array(hit.t))
     u, v = (np.array(x)[filled] for x in (hit.prim_uv.x, hit.prim_uv.y))
     return filled.reshape(size, size), SurfacePoints(
-        np.array(hit.prim_index)[filled].astype(np.int64), np.stack([1 - u - v, u, v], axis=1))
+        np.array(hit.prim_index)[filled].astype(np.int64), np.stack([1 - u - v, u, v], axis=1)
+    )
 
 
 def _image(values: np.ndarray, filled: np.ndarray) -> np.ndarray:

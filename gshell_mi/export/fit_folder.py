@@ -31,10 +31,18 @@ if TYPE_CHECKING:
     from ..scene import FitScene
 
 
-def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMaterial,
-               light: EnvironmentLight | None, views: int, texture: np.ndarray | None = None,
-               texture_levels: int = 0, *, light_turns: bool = False,
-               gains: np.ndarray | None = None) -> dict:
+def export_fit(
+    output: Path,
+    fit: FitScene,
+    material: MaterialField | GivenMaterial,
+    light: EnvironmentLight | None,
+    views: int,
+    texture: np.ndarray | None = None,
+    texture_levels: int = 0,
+    *,
+    light_turns: bool = False,
+    gains: np.ndarray | None = None,
+) -> dict:
     """Writes meshes, light, scene and pictures of the views.
 
     Args:
@@ -56,8 +64,9 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
     names = [[view.sensor.id() for view in group] for group in shown.values()]
     OwnFolder(output, "fit").claim("mesh.ply", "template.ply", "light.exr", "scene.xml", *view_files(*names))
     surface = fit.subject.surface
-    vertices, faces = _write_surface(output / "mesh.ply", surface, attributes_of(material, surface), texture,
-                                     texture_levels)
+    vertices, faces = _write_surface(
+        output / "mesh.ply", surface, attributes_of(material, surface), texture, texture_levels
+    )
     template = fit.subject.template()
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
     write_light(output / "light.exr", fit.light, light)
@@ -78,8 +87,12 @@ def export_fit(output: Path, fit: FitScene, material: MaterialField | GivenMater
         **({"held_out": scores[HELD_OUT]} if fit.held_out else {}),
         **({} if gains is None else {"exposures": _exposures(fit, gains)}),
         "counts": dataclasses.asdict(topology(vertices, faces)),
-        "versions": {"gshell_mi": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__,
-                     "numpy": np.__version__},
+        "versions": {
+            "gshell_mi": __version__,
+            "mitsuba": mi.__version__,
+            "drjit": dr.__version__,
+            "numpy": np.__version__,
+        },
         "variant": mi.variant(),
     }
 
@@ -98,15 +111,23 @@ def _exposures(fit: FitScene, gains: np.ndarray) -> dict[str, Any]:
     and their spread."""
     names, channels = [sensor.id() for sensor in fit.sensors], np.log2(gains)
     stops = channels.mean(axis=1)
-    return {"spread_stops": round(float(stops.std()), 4),
-            "spread_white_balance": round(float((channels - stops[:, None]).std()), 4),
-            "stops": {name: round(float(value), 4) for name, value in zip(names, stops, strict=True)},
-            "gains": {name: [round(float(value), 5) for value in gain]
-                      for name, gain in zip(names, gains, strict=True)}}
+    return {
+        "spread_stops": round(float(stops.std()), 4),
+        "spread_white_balance": round(float((channels - stops[:, None]).std()), 4),
+        "stops": {name: round(float(value), 4) for name, value in zip(names, stops, strict=True)},
+        "gains": {
+            name: [round(float(value), 5) for value in gain] for name, gain in zip(names, gains, strict=True)
+        },
+    }
 
 
-def _write_surface(path: Path, surface: SurfaceMesh, attributes: dict[str, np.ndarray],
-                   texture: np.ndarray | None = None, levels: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def _write_surface(
+    path: Path,
+    surface: SurfaceMesh,
+    attributes: dict[str, np.ndarray],
+    texture: np.ndarray | None = None,
+    levels: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns the vertices and faces that are written."""
     vertices, faces, _ = surface.to_numpy()
     normals = np.array(surface.vertex_normals().numpy()).T.reshape(-1, 3)

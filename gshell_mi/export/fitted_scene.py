@@ -33,5 +33,5 @@ def load_fitted_scene(folder: Path, envmap: Path | None = None) -> mi.Scene:
     content |= {f"sensor_{number}": sensor for number, sensor in enumerate(scene.sensors())}
     relit = mi.load_dict(content)
     for sensor, name in zip(relit.sensors(), names, strict=True):
-        sensor.set_id(name)    # any text, while a key of load_dict is not
+        sensor.set_id(name)  # any text, while a key of load_dict is not
     return relit

@@ -56,31 +56,52 @@ def glb_bytes(parts: list[Part], base: bytes | None = None) -> bytes:
     binary = _Binary()
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"gshell_mi {__version__}"},
-        "scene": 0, "scenes": [{"nodes": []}], "nodes": [], "meshes": [], "materials": []}
+        "scene": 0,
+        "scenes": [{"nodes": []}],
+        "nodes": [],
+        "meshes": [],
+        "materials": [],
+    }
     if base:
         document, data = _split(base)
         binary.data, binary.views, binary.accessors = data, document["bufferViews"], document["accessors"]
     for number, part in enumerate(parts, start=len(document["nodes"])):
         document["scenes"][0]["nodes"].append(number)
-        attributes = {name: binary.accessor(values.astype("<f4"), _ARRAY_BUFFER)
-                      for name, values in part.attributes.items()}
+        attributes = {
+            name: binary.accessor(values.astype("<f4"), _ARRAY_BUFFER)
+            for name, values in part.attributes.items()
+        }
         indices = binary.accessor(part.indices.reshape(-1, 1).astype("<u4"), _ELEMENT_BUFFER)
         mode = LINES if part.indices.shape[1] == 2 else TRIANGLES
         document["nodes"].append({"name": part.name, "mesh": number})
-        document["meshes"].append({"name": part.name, "primitives": [
-            {"attributes": attributes, "indices": indices, "mode": mode, "material": number}]})
+        document["meshes"].append(
+            {
+                "name": part.name,
+                "primitives": [
+                    {"attributes": attributes, "indices": indices, "mode": mode, "material": number}
+                ],
+            }
+        )
         numbers = {}
         for name, image in part.images.items():
             images = document.setdefault("images", [])
             numbers[name] = len(images)
-            images.append({"name": f"{part.name} {name}", "mimeType": "image/png",
-                           "bufferView": binary.view(_png(image))})
+            images.append(
+                {
+                    "name": f"{part.name} {name}",
+                    "mimeType": "image/png",
+                    "bufferView": binary.view(_png(image)),
+                }
+            )
         document["materials"].append({"name": part.name, **_with_textures(part.material, numbers)})
     if "images" in document:
         document["samplers"] = [_SAMPLER]
         document["textures"] = [{"source": i, "sampler": 0} for i in range(len(document["images"]))]
-    document |= {"accessors": binary.accessors, "bufferViews": binary.views,
-                 "buffers": [{"byteLength": len(binary.data)}]}
+    document |= {
+        "accessors": binary.accessors,
+        "bufferViews": binary.views,
+        "buffers": [{"byteLength": len(binary.data)}],
+    }
     text = json.dumps(document, separators=(",", ":")).encode()
     chunks = b""
     for kind, data, pad in ((b"JSON", text, b" "), (b"BIN\0", bytes(binary.data), b"\0")):
@@ -98,8 +119,9 @@ def read_part(data: bytes) -> Part:
         accessor = document["accessors"][number]
         view = document["bufferViews"][accessor["bufferView"]]
         kind = "<u4" if accessor["componentType"] == _UINT else "<f4"
-        return np.frombuffer(bytes(binary), kind, view["byteLength"] // 4,
-                             view["byteOffset"]).reshape(accessor["count"], -1)
+        return np.frombuffer(bytes(binary), kind, view["byteLength"] // 4, view["byteOffset"]).reshape(
+            accessor["count"], -1
+        )
 
     attributes = {name: array(number) for name, number in primitive["attributes"].items()}
     return Part(document["meshes"][0]["name"], array(primitive["indices"]).reshape(-1, 3), attributes)
@@ -107,7 +129,7 @@ def read_part(data: bytes) -> Part:
 
 def _split(data: bytes) -> tuple[dict[str, Any], bytearray]:
     length = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20:20 + length]), bytearray(data[28 + length:])
+    return json.loads(data[20 : 20 + length]), bytearray(data[28 + length :])
 
 
 class _Binary:
@@ -126,9 +148,12 @@ class _Binary:
         return len(self.views) - 1
 
     def accessor(self, values: np.ndarray, target: int) -> int:
-        accessor = {"bufferView": self.view(values.tobytes(), target), "count": len(values),
-                    "componentType": _UINT if values.dtype.kind == "u" else _FLOAT,
-                    "type": _TYPES[values.shape[1]]}
+        accessor = {
+            "bufferView": self.view(values.tobytes(), target),
+            "count": len(values),
+            "componentType": _UINT if values.dtype.kind == "u" else _FLOAT,
+            "type": _TYPES[values.shape[1]],
+        }
         if target == _ARRAY_BUFFER and values.shape[1] == 3:  # required of positions, harmless elsewhere
             accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
         self.accessors.append(accessor)

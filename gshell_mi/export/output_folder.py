@@ -46,14 +46,19 @@ class FitFolder:
 
     def __enter__(self) -> FitFolder:
         """Checks, without a trace, that the folder can be used."""
-        existing = next(path for path in (self.output, *self.output.absolute().parents)
-                        if os.path.lexists(path))
+        existing = next(
+            path for path in (self.output, *self.output.absolute().parents) if os.path.lexists(path)
+        )
         if not existing.is_dir():
-            raise UserError(f"Output folder '{self.output}' cannot be made because '{existing}' is a file; "
-                            f"choose another one with -o.")
+            raise UserError(
+                f"Output folder '{self.output}' cannot be made because '{existing}' is a file; "
+                f"choose another one with -o."
+            )
         if not os.access(existing, os.W_OK | os.X_OK):
-            raise UserError(f"Output folder '{self.output}' cannot be written (no permission in "
-                            f"'{existing}'); choose another one with -o.")
+            raise UserError(
+                f"Output folder '{self.output}' cannot be written (no permission in "
+                f"'{existing}'); choose another one with -o."
+            )
         with ExitStack() as stack:
             if self.output.is_dir():
                 stack.enter_context(locked(self.output))
@@ -102,8 +107,10 @@ class FitFolder:
                 place.clear(keep=(CHECKPOINT,))  # which the new one replaces
             place.write_mark(place.files | {CHECKPOINT, LOG})
         except OSError as error:
-            raise UserError(f"Output folder '{self.output}' cannot be written ({error.strerror or error}); "
-                            f"choose another one with -o.") from error
+            raise UserError(
+                f"Output folder '{self.output}' cannot be written ({error.strerror or error}); "
+                f"choose another one with -o."
+            ) from error
 
     def finish(self) -> None:
         """Puts the fit in the place of the earlier one, if there is one."""
@@ -124,8 +131,10 @@ class FitFolder:
         self._check_free(own)
         earlier = [*own.present(), *unfinished.present()]
         if earlier and not self._overwrite:
-            raise UserError(f"'{self.output}' holds an earlier fit ({earlier[0]}); continue it with "
-                            f"--resume, replace it with --overwrite or choose another folder with -o.")
+            raise UserError(
+                f"'{self.output}' holds an earlier fit ({earlier[0]}); continue it with "
+                f"--resume, replace it with --overwrite or choose another folder with -o."
+            )
         self.place = unfinished.path if earlier else self.output
 
     def _check_free(self, own: OwnFolder) -> None:
@@ -135,8 +144,10 @@ class FitFolder:
         unfinished = self.output / _UNFINISHED
         if os.path.lexists(unfinished):
             if unfinished.is_symlink() or not OwnFolder(unfinished, "fit").is_marked():
-                raise UserError(f"'{unfinished}' is in the way and was not made by a fit; move it away or "
-                                f"choose another folder with -o.")
+                raise UserError(
+                    f"'{unfinished}' is in the way and was not made by a fit; move it away or "
+                    f"choose another folder with -o."
+                )
             OwnFolder(unfinished, "fit").check_free(self._names)
 
 

@@ -31,18 +31,31 @@ class FittedMesh:
     attributes: dict[str, np.ndarray]
 
 
-def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray,
-              attributes: dict[str, np.ndarray]) -> None:
+def write_ply(
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    attributes: dict[str, np.ndarray],
+) -> None:
     """Writes a mesh; the attribute ``vertex_color`` becomes the properties ``color_0`` and so on."""
     columns = {"x": vertices[:, 0], "y": vertices[:, 1], "z": vertices[:, 2]}
     columns |= {"nx": normals[:, 0], "ny": normals[:, 1], "nz": normals[:, 2]}
     for name, values in attributes.items():
         for channel, column in enumerate(np.atleast_2d(values.T)):
             columns[f"{name.removeprefix('vertex_')}_{channel}"] = column
-    header = "\n".join([
-        "ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}",
-        *(f"property float {name}" for name in columns),
-        f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""])
+    header = "\n".join(
+        [
+            "ply",
+            "format binary_little_endian 1.0",
+            f"element vertex {len(vertices)}",
+            *(f"property float {name}" for name in columns),
+            f"element face {len(faces)}",
+            "property list uchar int vertex_indices",
+            "end_header",
+            "",
+        ]
+    )
     table = np.empty((len(vertices), len(columns)), "<f4")
     for index, column in enumerate(columns.values()):
         table[:, index] = column
@@ -67,8 +80,10 @@ def read_ply(path: Path) -> FittedMesh:
         mesh: Any = trimesh.load(path, process=False, force="mesh")
         table = mesh.metadata["_ply_raw"]["vertex"]["data"]
         columns = {name: np.ravel(table[name]) for name in table.dtype.names}
-        stacked = {axes: np.stack([columns.pop(name) for name in names], axis=1) for axes, names in
-                   (("p", ("x", "y", "z")), ("n", ("nx", "ny", "nz")))}
+        stacked = {
+            axes: np.stack([columns.pop(name) for name in names], axis=1)
+            for axes, names in (("p", ("x", "y", "z")), ("n", ("nx", "ny", "nz")))
+        }
         for name in sorted(columns):
             stem, _, channel = name.rpartition("_")
             attributes.setdefault(stem, []).append((int(channel), columns[name]))
@@ -76,13 +91,23 @@ def read_ply(path: Path) -> FittedMesh:
     except Exception as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
         raise UserError(f"'{path}' cannot be read as a fitted mesh ({reason}); run the fit again.") from error
-    return FittedMesh(stacked["p"], np.asarray(mesh.faces, np.int64), stacked["n"], {
-        name: channels[0][1] if len(channels) == 1 else np.stack([c for _, c in sorted(channels)], axis=1)
-        for name, channels in attributes.items()})
+    return FittedMesh(
+        stacked["p"],
+        np.asarray(mesh.faces, np.int64),
+        stacked["n"],
+        {
+            name: channels[0][1] if len(channels) == 1 else np.stack([c for _, c in sorted(channels)], axis=1)
+            for name, channels in attributes.items()
+        },
+    )
 
 
-def _check(mesh: trimesh.Trimesh, stacked: dict[str, np.ndarray], columns: dict[str, np.ndarray],
-           attributes: dict[str, list[tuple[int, np.ndarray]]]) -> None:
+def _check(
+    mesh: trimesh.Trimesh,
+    stacked: dict[str, np.ndarray],
+    columns: dict[str, np.ndarray],
+    attributes: dict[str, list[tuple[int, np.ndarray]]],
+) -> None:
     for name, channels in attributes.items():
         if sorted(number for number, _ in channels) not in ([0], [0, 1, 2]):
             raise ValueError(f"its {name} has neither one channel nor three")

@@ -31,7 +31,7 @@ def triangle_quality(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     0.866
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    squared = sum((edge ** 2).sum(1) for edge in (b - a, c - b, a - c))
+    squared = sum((edge**2).sum(1) for edge in (b - a, c - b, a - c))
     return 4 * np.sqrt(3) * face_areas(vertices, faces) / np.maximum(squared, 1e-300)
 
 
@@ -41,8 +41,14 @@ def edge_length_for(vertices: np.ndarray, faces: np.ndarray, face_count: int) ->
     return float(np.sqrt(4 / np.sqrt(3) * area / face_count))
 
 
-def remesh(vertices: np.ndarray, faces: np.ndarray, edge_length: float, *,
-           resample_boundary: bool = False, min_quality: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def remesh(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    edge_length: float,
+    *,
+    resample_boundary: bool = False,
+    min_quality: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
     """Isotropic triangles on the same surface (Botsch and Kobbelt, "A Remeshing Approach to Multiresolution
     Modeling", SGP 2004; implementation: gpytoolbox).
 
@@ -64,27 +70,37 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, edge_length: float, *,
     """
     size = np.linalg.norm(np.ptp(vertices, axis=0))
     if not 0 < edge_length < size / 4:
-        raise UserError(f"An edge length of {edge_length:g} does not suit an object of size {size:.3g}; "
-                        f"give one between 0 and {size / 4:.3g}.")
+        raise UserError(
+            f"An edge length of {edge_length:g} does not suit an object of size {size:.3g}; "
+            f"give one between 0 and {size / 4:.3g}."
+        )
     before = topology(vertices, faces)
     for factor in _ATTEMPTS if min_quality > 0 else (1.0,):
         v, f = _remesh_once(vertices, faces, factor * edge_length, resample_boundary, min_quality)
         worst = triangle_quality(v, f).min()
         after = topology(v, f)
-        changed = [name for name in ("components", "boundary_loops", "nonmanifold_edges")
-                   if getattr(after, name) != getattr(before, name)]
+        changed = [
+            name
+            for name in ("components", "boundary_loops", "nonmanifold_edges")
+            if getattr(after, name) != getattr(before, name)
+        ]
         if worst >= min_quality and not changed:
             return v, f
     if changed:
-        raise UserError(f"Remeshing to edges of {edge_length:g} would change the number of "
-                        f"{changed[0].replace('_', ' ')} from {getattr(before, changed[0])} to "
-                        f"{getattr(after, changed[0])}; take a smaller edge length.")
-    raise UserError(f"The worst triangle has a quality of {worst:.3f}, below {min_quality:g}; try another "
-                    f"edge length or a lower quality.")
+        raise UserError(
+            f"Remeshing to edges of {edge_length:g} would change the number of "
+            f"{changed[0].replace('_', ' ')} from {getattr(before, changed[0])} to "
+            f"{getattr(after, changed[0])}; take a smaller edge length."
+        )
+    raise UserError(
+        f"The worst triangle has a quality of {worst:.3f}, below {min_quality:g}; try another "
+        f"edge length or a lower quality."
+    )
 
 
-def _remesh_once(vertices: np.ndarray, faces: np.ndarray, edge_length: float, resample_boundary: bool,
-                 min_quality: float) -> tuple[np.ndarray, np.ndarray]:
+def _remesh_once(
+    vertices: np.ndarray, faces: np.ndarray, edge_length: float, resample_boundary: bool, min_quality: float
+) -> tuple[np.ndarray, np.ndarray]:
     import gpytoolbox  # takes a second to import
 
     v, f = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
@@ -124,8 +140,12 @@ def _bad_edges(v: np.ndarray, f: np.ndarray, min_quality: float) -> np.ndarray:
     return np.take_along_axis(edges, lengths.argsort(axis=1)[..., None], axis=1).reshape(-1, 2)
 
 
-def _collapse(v: np.ndarray, f: np.ndarray, candidates: Callable[[np.ndarray, np.ndarray], np.ndarray],
-              greatest_turn: float = _GREATEST_TURNS[0]) -> tuple[np.ndarray, np.ndarray]:
+def _collapse(
+    v: np.ndarray,
+    f: np.ndarray,
+    candidates: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    greatest_turn: float = _GREATEST_TURNS[0],
+) -> tuple[np.ndarray, np.ndarray]:
     """Collapses the edges that ``candidates(v, f)`` lists, in that order, until none is left that may be."""
     v = v.copy()
     while True:
@@ -137,8 +157,9 @@ def _collapse(v: np.ndarray, f: np.ndarray, candidates: Callable[[np.ndarray, np
     return v[used], inverse.reshape(-1, 3)
 
 
-def _collapse_once(v: np.ndarray, f: np.ndarray, edges: np.ndarray,
-                   greatest_turn: float) -> np.ndarray | None:
+def _collapse_once(
+    v: np.ndarray, f: np.ndarray, edges: np.ndarray, greatest_turn: float
+) -> np.ndarray | None:
     """One round of collapses whose neighbourhoods do not touch; None if there was nothing to do.
 
     A collapse keeps the surface a manifold of the same topology if the two ends have no other common
@@ -153,7 +174,7 @@ def _collapse_once(v: np.ndarray, f: np.ndarray, edges: np.ndarray,
     touched, gone, merged = np.zeros(len(v), bool), np.zeros(len(f), bool), np.arange(len(v))
     changed = False
     for a, b in edges.tolist():
-        faces_a, faces_b = (order[ends[i]: ends[i + 1]] // 3 for i in (a, b))
+        faces_a, faces_b = (order[ends[i] : ends[i + 1]] // 3 for i in (a, b))
         ring = np.unique(f[np.concatenate([faces_a, faces_b])])
         if touched[ring].any():
             continue

@@ -15,8 +15,9 @@ _NARROWEST = 2e-3
 _ROUNDS = 8
 
 
-def without_slivers(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray,
-                    narrowest: float = _NARROWEST) -> np.ndarray:
+def without_slivers(
+    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, narrowest: float = _NARROWEST
+) -> np.ndarray:
     """The vertices, of which those that make triangles narrow have moved as little as mends that.
 
     Where two cuts of an extraction nearly meet, triangles come out as slivers. Stock Mitsuba interpolates NaN
@@ -39,7 +40,7 @@ def without_slivers(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray
     moved = np.array(vertices, np.float64)
     for _ in range(_ROUNDS):
         corners = moved[faces]
-        edges = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)   # edge i lies opposite corner i
+        edges = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)  # edge i lies opposite corner i
         lengths = np.linalg.norm(edges, axis=2)
         corner = lengths.argmax(axis=1)
         length = lengths.max(axis=1)

@@ -88,14 +88,22 @@ def write_scene(path: Path, light: mi.Emitter, sensors: list[mi.Sensor]) -> None
     textures = "\n".join(
         f'                <texture type="mesh_attribute" name="{parameter}">\n'
         f'                    <string name="name" value="{attribute}"/>\n'
-        f'                </texture>' for attribute, parameter in ATTRIBUTES.items())
+        f"                </texture>"
+        for attribute, parameter in ATTRIBUTES.items()
+    )
     light_to_world = ""
     parameters = mi.traverse(light)
     if "to_world" in parameters:
-        light_to_world = (f'\n        <transform name="to_world">'
-                          f'<matrix value="{_matrix(parameters["to_world"].matrix)}"/></transform>')
-    text = _SCENE.format(depth=MAX_DEPTH, textures=textures, light_to_world=light_to_world,
-                         sensors="\n".join(_sensor(sensor) for sensor in sensors))
+        light_to_world = (
+            f'\n        <transform name="to_world">'
+            f'<matrix value="{_matrix(parameters["to_world"].matrix)}"/></transform>'
+        )
+    text = _SCENE.format(
+        depth=MAX_DEPTH,
+        textures=textures,
+        light_to_world=light_to_world,
+        sensors="\n".join(_sensor(sensor) for sensor in sensors),
+    )
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
@@ -113,10 +121,13 @@ def up_axis(sensors: list[mi.Sensor]) -> int:
         UserError: there is no sensor.
     """
     if not sensors:
-        raise UserError("The scene of the fit has no sensors, so nothing says which way is up; run the fit "
-                        "again, or put its scene.xml back.")
-    up = np.mean([np.array(mi.traverse(sensor)["to_world"].matrix).reshape(4, 4)[:3, 1]
-                  for sensor in sensors], axis=0)
+        raise UserError(
+            "The scene of the fit has no sensors, so nothing says which way is up; run the fit "
+            "again, or put its scene.xml back."
+        )
+    up = np.mean(
+        [np.array(mi.traverse(sensor)["to_world"].matrix).reshape(4, 4)[:3, 1] for sensor in sensors], axis=0
+    )
     return int(np.argmax(np.concatenate([up, -up])))
 
 
@@ -126,12 +137,23 @@ def _sensor(sensor: mi.Sensor) -> str:
     film = sensor.film()
     (width, height), (crop_width, crop_height) = film.size(), film.crop_size()
     crop_x, crop_y = film.crop_offset()
-    optics = "\n".join(f'        <float name="{name}" value="{float(np.ravel(parameters[name])[0]):.9g}"/>'
-                       for name in OPTICS[kind])
-    return _SENSOR.format(kind=kind, id=quoteattr(sensor.id()), fov=float(parameters["x_fov"][0]),
-                          optics=optics, to_world=_matrix(parameters["to_world"].matrix),
-                          width=width, height=height, crop_width=crop_width, crop_height=crop_height,
-                          crop_x=crop_x, crop_y=crop_y)
+    optics = "\n".join(
+        f'        <float name="{name}" value="{float(np.ravel(parameters[name])[0]):.9g}"/>'
+        for name in OPTICS[kind]
+    )
+    return _SENSOR.format(
+        kind=kind,
+        id=quoteattr(sensor.id()),
+        fov=float(parameters["x_fov"][0]),
+        optics=optics,
+        to_world=_matrix(parameters["to_world"].matrix),
+        width=width,
+        height=height,
+        crop_width=crop_width,
+        crop_height=crop_height,
+        crop_x=crop_x,
+        crop_y=crop_y,
+    )
 
 
 def _matrix(matrix: ArrayLike) -> str:

@@ -34,8 +34,13 @@ def view_files(training: Iterable[str], held_out: Iterable[str]) -> list[str]:
     return [f"{folder}/{name}.png" for place, name in views for folder in (place, MASKS)]
 
 
-def write_views(output: Path, folder: str, views: Sequence[View], lights: Sequence[mi.Transform4f],
-                gains: Sequence[np.ndarray] | np.ndarray = ()) -> dict:
+def write_views(
+    output: Path,
+    folder: str,
+    views: Sequence[View],
+    lights: Sequence[mi.Transform4f],
+    gains: Sequence[np.ndarray] | np.ndarray = (),
+) -> dict:
     """Renders the exported scene; writes a triptych per view and, if its target has alpha, the masks.
 
     Args:
@@ -67,8 +72,10 @@ def write_views(output: Path, folder: str, views: Sequence[View], lights: Sequen
             (output / MASKS).mkdir(exist_ok=True)
             overlay = mask_overlay(target.rgba[..., 3], image[..., 3], np.asarray(target.known) > 0.5)
             write_png(output / MASKS / f"{name}.png", overlay)
-    return {"views": {name: _rounded(found) for name, found in scores.items()},
-            "mean": _rounded(mean_scores(scores.values()))}
+    return {
+        "views": {name: _rounded(found) for name, found in scores.items()},
+        "mean": _rounded(mean_scores(scores.values())),
+    }
 
 
 def scores_line(scores: dict) -> str:
@@ -81,11 +88,16 @@ def scores_line(scores: dict) -> str:
     mean, views = scores["mean"], scores["views"]
     inside = "" if mean["psnr_inside"] is None else f" ({mean['psnr_inside']:.2f} dB inside the mask)"
     parts = [f"{mean['psnr']:.2f} dB{inside}"]
-    parts += [f"{label} {mean[name]:.3f}" for name, label in (("ssim", "SSIM"), ("flip", "FLIP"),
-                                                              ("mask_iou", "IoU")) if mean[name] is not None]
+    parts += [
+        f"{label} {mean[name]:.3f}"
+        for name, label in (("ssim", "SSIM"), ("flip", "FLIP"), ("mask_iou", "IoU"))
+        if mean[name] is not None
+    ]
     worst = min(views, key=lambda name: views[name]["psnr"])
-    return (f"{', '.join(parts)} over {counted(len(views), 'view')}; "
-            f"worst: {worst}, {views[worst]['psnr']:.2f} dB")
+    return (
+        f"{', '.join(parts)} over {counted(len(views), 'view')}; "
+        f"worst: {worst}, {views[worst]['psnr']:.2f} dB"
+    )
 
 
 def _rounded(scores: Scores) -> Scores:

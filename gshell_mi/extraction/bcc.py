@@ -65,6 +65,14 @@ class BccExtraction(TetExtraction):
 def existing_tets_table() -> np.ndarray:
     """``[lacking]``: bit i tells that tetrahedron i has all its corners; ``lacking`` has bit c set if corner
     c of the cell does not exist."""
-    return np.array([sum(1 << tet for tet, corners in enumerate(tables.TETS)
-                         if not any(lacking >> corner & 1 for corner in corners))
-                     for lacking in range(256)], np.uint32)
+    return np.array(
+        [
+            sum(
+                1 << tet
+                for tet, corners in enumerate(tables.TETS)
+                if not any(lacking >> corner & 1 for corner in corners)
+            )
+            for lacking in range(256)
+        ],
+        np.uint32,
+    )

@@ -104,8 +104,9 @@ class CubeExtraction(MarchingExtraction[_Polygons]):
         dr.eval(faces)
         return faces
 
-    def clip(self, polygons: _Polygons, record: UInt32, count: int,
-             kept_count: int) -> tuple[Array3u, UInt32, UInt32]:
+    def clip(
+        self, polygons: _Polygons, record: UInt32, count: int, kept_count: int
+    ) -> tuple[Array3u, UInt32, UInt32]:
         none = dr.zeros(self.uint_t, 0)
         if dr.width(polygons.key) == 0:
             return dr.zeros(self.faces_t, 0), none, none
@@ -133,9 +134,7 @@ class CubeExtraction(MarchingExtraction[_Polygons]):
         dr.eval(cut, owner, kind)
 
         cut_sides = dr.zeros(self.uint_t, count)  # per mesh vertex: bits of the sides that are cut
-        dr.scatter_reduce(
-            dr.ReduceOp.Or, cut_sides, self.uint_t(1) << kind, owner, cut, dr.ReduceMode.Local
-        )
+        dr.scatter_reduce(dr.ReduceOp.Or, cut_sides, self.uint_t(1) << kind, owner, cut, dr.ReduceMode.Local)
         before = dr.prefix_reduce(dr.ReduceOp.Add, dr.popcnt(cut_sides))
         cut_count = dr.sum(dr.popcnt(cut_sides))[0]
 

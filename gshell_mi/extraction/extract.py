@@ -1,6 +1,5 @@
 """The entrance to extraction: checks the fields and hands them to the lattice's algorithm."""
 
-
 import drjit as dr
 
 from ..arrays import Field, Float
@@ -74,8 +73,9 @@ def extract(
     checked = {name: _flat(name, field, sizes[name]) for name, field in fields.items() if field is not None}
     _check_finite(checked)
     algorithm = _ALGORITHMS[lattice.grid](lattice, type(checked["sdf"]))
-    return algorithm.run(checked["sdf"], checked.get("msdf"), checked.get("deform"), template,
-                         checked.get("weights"))
+    return algorithm.run(
+        checked["sdf"], checked.get("msdf"), checked.get("deform"), template, checked.get("weights")
+    )
 
 
 def _flat(name: str, field: Field, count: int) -> Field:

@@ -56,8 +56,15 @@ class FlexiCubesExtraction(GridExtraction):
         super().__init__(lattice, float_t)
         self.margin = dr.opaque(float_t, _MARGIN)
 
-    def surface(self, cells: ActiveCells, sdf: Float, msdf: Float | None, deform: Field | None,
-                with_template: bool, weights: Float | None) -> SurfaceMesh:
+    def surface(
+        self,
+        cells: ActiveCells,
+        sdf: Float,
+        msdf: Float | None,
+        deform: Field | None,
+        with_template: bool,
+        weights: Float | None,
+    ) -> SurfaceMesh:
         a, _ = self.crossed_edges(cells)
         count = dr.width(a)
         if count == 0:
@@ -180,8 +187,9 @@ class FlexiCubesExtraction(GridExtraction):
 
     # Quads --------------------------------------------------------------------------------------------
 
-    def quads(self, inside: UInt32, a: UInt32, polygons: _Polygons, weights: Float | None,
-              deform: Field | None) -> tuple[Array3u, Bool]:
+    def quads(
+        self, inside: UInt32, a: UInt32, polygons: _Polygons, weights: Float | None, deform: Field | None
+    ) -> tuple[Array3u, Bool]:
         """Two triangles per crossed edge, and whether its quad is split from the first corner on."""
         count = dr.width(a)
         slot = dr.arange(self.uint_t, dr.width(polygons.crossing))
@@ -222,8 +230,12 @@ class FlexiCubesExtraction(GridExtraction):
     def turn(self, inside: UInt32, a: UInt32) -> list[UInt32]:
         """The numbers of the cubes around edges, anticlockwise seen from outside."""
         upwards = is_set(inside, a)
-        return [self.uint_t(0), dr.select(upwards, self.uint_t(1), 2), self.uint_t(3),
-                dr.select(upwards, self.uint_t(2), 1)]
+        return [
+            self.uint_t(0),
+            dr.select(upwards, self.uint_t(1), 2),
+            self.uint_t(3),
+            dr.select(upwards, self.uint_t(2), 1),
+        ]
 
     @staticmethod
     def least_area(p: list[Array3f]) -> Float:
@@ -233,8 +245,9 @@ class FlexiCubesExtraction(GridExtraction):
             dr.squared_norm(dr.cross(p[3] - p[2], p[0] - p[2])),
         )
 
-    def edge_names(self, count: int, polygons: _Polygons, inside: UInt32, a: UInt32,
-                   diagonal: Bool) -> Array3u:
+    def edge_names(
+        self, count: int, polygons: _Polygons, inside: UInt32, a: UInt32, diagonal: Bool
+    ) -> Array3u:
         """Names of the triangles' edges: four times a crossing plus a face around it, or a diagonal's."""
         slot = dr.arange(self.uint_t, dr.width(polygons.crossing))
         following = dr.gather(self.uint_t, polygons.crossing, (slot & ~self.uint_t(7)) | polygons.side >> 4)

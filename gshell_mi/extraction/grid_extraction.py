@@ -67,15 +67,23 @@ class GridExtraction(ABC):
         # spans 16 units in the last place of a coordinate near 1.
         self.margin = dr.opaque(float_t, (16 * 2.0**-24 / lattice.spacing) ** 0.5)
 
-    def run(self, sdf: Float, msdf: Float | None, deform: Field | None, with_template: bool,
-            weights: Float | None) -> SurfaceMesh:
+    def run(
+        self, sdf: Float, msdf: Float | None, deform: Field | None, with_template: bool, weights: Float | None
+    ) -> SurfaceMesh:
         """The mesh of flat fields that ``extract`` has checked."""
         cells = self.active_cells(dr.detach(sdf))
         return replace(self.surface(cells, sdf, msdf, deform, with_template, weights), cells=cells.cell)
 
     @abstractmethod
-    def surface(self, cells: ActiveCells, sdf: Float, msdf: Float | None, deform: Field | None,
-                with_template: bool, weights: Float | None) -> SurfaceMesh:
+    def surface(
+        self,
+        cells: ActiveCells,
+        sdf: Float,
+        msdf: Float | None,
+        deform: Field | None,
+        with_template: bool,
+        weights: Float | None,
+    ) -> SurfaceMesh:
         """The mesh in the active cells."""
 
     # Edges --------------------------------------------------------------------------------------------
@@ -187,8 +195,14 @@ class GridExtraction(ABC):
         s_a, s_b = gather(self.float_t, sdf, a), gather(self.float_t, sdf, b)
         return EdgePoints(a, b, self.zero_crossing(s_a, s_b))
 
-    def mesh(self, blocks: tuple[Points, ...], faces: Array3u, msdf: Float | None, deform: Field | None,
-             kept_count: int) -> SurfaceMesh:
+    def mesh(
+        self,
+        blocks: tuple[Points, ...],
+        faces: Array3u,
+        msdf: Float | None,
+        deform: Field | None,
+        kept_count: int,
+    ) -> SurfaceMesh:
         stencil = Stencil(blocks)
         vertices = stencil.apply(lambda vertex: self.lattice.offset_positions(vertex, deform, self.float_t))
         if msdf is None:
@@ -228,8 +242,15 @@ PolygonsT = TypeVar("PolygonsT", bound=Polygons)
 class MarchingExtraction(GridExtraction, Generic[PolygonsT]):
     """Extractions whose polygons' vertices lie on the edges of the lattice."""
 
-    def surface(self, cells: ActiveCells, sdf: Float, msdf: Float | None, deform: Field | None,
-                with_template: bool, weights: Float | None) -> SurfaceMesh:
+    def surface(
+        self,
+        cells: ActiveCells,
+        sdf: Float,
+        msdf: Float | None,
+        deform: Field | None,
+        with_template: bool,
+        weights: Float | None,
+    ) -> SurfaceMesh:
         a, b = self.crossed_edges(cells)
         count = dr.width(a)
         if count == 0:
@@ -276,8 +297,9 @@ class MarchingExtraction(GridExtraction, Generic[PolygonsT]):
         """Triangles of whole polygons."""
 
     @abstractmethod
-    def clip(self, polygons: PolygonsT, record: UInt32, count: int,
-             kept_count: int) -> tuple[Array3u, UInt32, UInt32]:
+    def clip(
+        self, polygons: PolygonsT, record: UInt32, count: int, kept_count: int
+    ) -> tuple[Array3u, UInt32, UInt32]:
         """Faces of the kept part of all polygons, and the ends of the segments that cut vertices lie on.
 
         Returns:

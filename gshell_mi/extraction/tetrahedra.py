@@ -79,8 +79,9 @@ class TetExtraction(MarchingExtraction[_Polygons]):
         dr.eval(faces)
         return faces
 
-    def clip(self, polygons: _Polygons, record: UInt32, count: int,
-             kept_count: int) -> tuple[Array3u, UInt32, UInt32]:
+    def clip(
+        self, polygons: _Polygons, record: UInt32, count: int, kept_count: int
+    ) -> tuple[Array3u, UInt32, UInt32]:
         kept_opaque = dr.opaque(self.uint_t, kept_count)
         stays = [c < kept_opaque for c in polygons.corners]
         kept = dr.zeros(self.uint_t)
@@ -130,11 +131,7 @@ class TetExtraction(MarchingExtraction[_Polygons]):
             dr.scatter(local, kept_opaque + cut_vertex, slot + 4 + i, cuts[i], mode=dr.ReduceMode.Permute)
 
         kept = sum(dr.select(stay, self.uint_t(1 << i), 0) for i, stay in enumerate(stays))
-        entry = dr.gather(
-            self.uint_t,
-            self.uint_t(tables.clip_table()),
-            dr.select(quad, kept + 16, kept & 7),
-        )
+        entry = dr.gather(self.uint_t, self.uint_t(tables.clip_table()), dr.select(quad, kept + 16, kept & 7))
         dr.eval(entry)
         polygon, triangle = expand((self.uint_t(1) << (entry >> 27)) - 1, 2)
         packed = dr.gather(self.uint_t, entry, polygon) >> (9 * triangle)

@@ -1,14 +1,14 @@
 """Cutting a triangle mesh by the sign at its vertices, with names for its edges instead of a search."""
 
-
 import drjit as dr
 
 from ..arrays import Array3u, UInt32
 from .surface_mesh import concatenate
 
 
-def cut_triangles(faces: Array3u, names: Array3u, name_count: int,
-                  kept_count: int) -> tuple[Array3u, UInt32, UInt32]:
+def cut_triangles(
+    faces: Array3u, names: Array3u, name_count: int, kept_count: int
+) -> tuple[Array3u, UInt32, UInt32]:
     """The part of a mesh around its first vertices, which ends within the edges to the others.
 
     Args:

@@ -17,6 +17,10 @@ from .sinusoidal import SinusoidalNetwork
 
 __all__ = ["FlexiCubesWeights", "HashGridNetwork", "MultiresolutionGrid", "SinusoidalNetwork", "losses"]
 
-for name, kind in (("flexicubes", FlexiCubesWeights), ("multiresolution", MultiresolutionGrid),
-                   ("hashgrid", HashGridNetwork), ("sinusoidal", SinusoidalNetwork)):
+for name, kind in (
+    ("flexicubes", FlexiCubesWeights),
+    ("multiresolution", MultiresolutionGrid),
+    ("hashgrid", HashGridNetwork),
+    ("sinusoidal", SinusoidalNetwork),
+):
     register_parametrisation(name, kind)

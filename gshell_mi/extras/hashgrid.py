@@ -30,9 +30,16 @@ class HashGridNetwork(NetworkFields):
     def make_network(self, rng: dr.random.Generator) -> nn.Module:
         finest = max(self.lattice.resolution, _COARSEST + 1)
         self._encoding = nn.HashGridEncoding(
-            mi.Float, 3, n_levels=_LEVELS, n_features_per_level=_FEATURES, hashmap_size=_TABLE,
-            base_resolution=_COARSEST, per_level_scale=(finest / _COARSEST) ** (1 / (_LEVELS - 1)),
-            align_corners=True, rng=rng)
+            mi.Float,
+            3,
+            n_levels=_LEVELS,
+            n_features_per_level=_FEATURES,
+            hashmap_size=_TABLE,
+            base_resolution=_COARSEST,
+            per_level_scale=(finest / _COARSEST) ** (1 / (_LEVELS - 1)),
+            align_corners=True,
+            rng=rng,
+        )
         return layers(_LEVELS * _FEATURES, _WIDTH, _HIDDEN, nn.ReLU, rng)
 
     def parameters(self) -> Mapping[str, mi.Float | mi.TensorXf]:

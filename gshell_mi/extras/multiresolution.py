@@ -27,8 +27,9 @@ class MultiresolutionGrid(Parametrisation):
     levels start at 0, so the fields start exactly where they are told to.
     """
 
-    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules,
-                 seed: int = 0):
+    def __init__(
+        self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules, seed: int = 0
+    ):
         self.lattice, self.rules = lattice, rules
         sizes = (max(lattice.resolution >> level, 1) + 1 for level in range(1, _COARSE_LEVELS + 1))
         self._sizes = list(dict.fromkeys(sizes))
@@ -61,8 +62,13 @@ class MultiresolutionGrid(Parametrisation):
         if self._cubes:
             self._cubes.carry(carried)
 
-    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
-             diffuse: LatticeDiffusion | None = None) -> None:
+    def step(
+        self,
+        gradients: Mapping[str, mi.Float],
+        progress: float,
+        iteration: int = 0,
+        diffuse: LatticeDiffusion | None = None,
+    ) -> None:
         rules, optimizer = self.rules, self.optimizer
         own = {name: trusted(gradients[name]) for name in self._names}
         vertex = touched(own, self.lattice.vertex_count)
@@ -73,8 +79,9 @@ class MultiresolutionGrid(Parametrisation):
             dr.backward(total)
         decay = decay_at(progress) / (1 + len(self._sizes))
         far, local = decay * rules.rate * self.lattice.spacing, decay * rules.deform_rate
-        optimizer.set_learning_rate({key: local if key.startswith("deform") else far
-                                     for key in optimizer.keys()})
+        optimizer.set_learning_rate(
+            {key: local if key.startswith("deform") else far for key in optimizer.keys()}
+        )
         optimizer.step()
         if self._cubes:
             self._cubes.step({"weights": gradients["weights"]}, progress)

@@ -60,8 +60,9 @@ class NetworkFields(Parametrisation):
     fitting_rate: float
     """Adam's first step of the fit to the start; falls hundredfold."""
 
-    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice,
-                 rules: StepRules, seed: int):
+    def __init__(
+        self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules, seed: int
+    ):
         self.lattice, self.rules, self.seed = lattice, rules, seed
         self._start = {name: mi.Float(start[name]) for name in ("sdf", "msdf", "deform") if name in start}
         self._near = dr.compress(dr.abs(self._start["sdf"]) < _NEAR_CELLS * lattice.spacing)
@@ -144,15 +145,21 @@ class NetworkFields(Parametrisation):
 
     # --- steps
 
-    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
-             diffuse: LatticeDiffusion | None = None) -> None:
+    def step(
+        self,
+        gradients: Mapping[str, mi.Float],
+        progress: float,
+        iteration: int = 0,
+        diffuse: LatticeDiffusion | None = None,
+    ) -> None:
         own = {name: trusted(gradients[name]) for name in self._start}
         vertex = touched(own, self.lattice.vertex_count)
         if dr.width(vertex):
             self.attach()
             values = self._at(vertex)
-            total = sum(dr.sum(values[name] * taken(name, gradient, vertex))
-                        for name, gradient in own.items())
+            total = sum(
+                dr.sum(values[name] * taken(name, gradient, vertex)) for name, gradient in own.items()
+            )
             decay = decay_at(progress)
             total += dr.opaque(mi.Float, _EIKONAL_WEIGHT * decay) * self._eikonal(iteration)
             dr.backward(total)
@@ -162,8 +169,9 @@ class NetworkFields(Parametrisation):
         if self._cubes:
             self._cubes.step({"weights": gradients["weights"]}, progress)
 
-    def _limit(self, before: Mapping, vertex: mi.UInt32, values: Mapping[str, mi.Float],
-               decay: float) -> None:
+    def _limit(
+        self, before: Mapping, vertex: mi.UInt32, values: Mapping[str, mi.Float], decay: float
+    ) -> None:
         """Shortens the step from ``before`` where it moves the fields too far: a network's parameters say
         nothing of how far that is.
 
@@ -187,13 +195,17 @@ class NetworkFields(Parametrisation):
         self.attach()
         vertex = self._batch(iteration)
         values = self._at(vertex)
-        squares = {name: dr.square(values[name] - taken(name, wanted, vertex))
-                   for name, wanted in self._start.items()}
+        squares = {
+            name: dr.square(values[name] - taken(name, wanted, vertex))
+            for name, wanted in self._start.items()
+        }
         # Far away only a relative error matters.
         cell, distance = self.lattice.spacing, taken("sdf", self._start["sdf"], vertex)
         importance = dr.rcp(dr.square(cell) + dr.square(0.25 * distance))
-        errors = {name: dr.mean(square if name == "deform" else importance * square)
-                  for name, square in squares.items()}
+        errors = {
+            name: dr.mean(square if name == "deform" else importance * square)
+            for name, square in squares.items()
+        }
         total = mi.Float(sum(errors.values()))
         dr.backward(total)
         self._adam_step(self.fitting_rate * 0.01 ** (iteration / self.fitting_steps))
@@ -235,8 +247,9 @@ class NetworkFields(Parametrisation):
         return dr.select(lane % 4 == 0, anywhere, beside)
 
 
-def layers(features: int, width: int, hidden: int, activation: type[nn.Module],
-           rng: dr.random.Generator) -> nn.Sequential:
+def layers(
+    features: int, width: int, hidden: int, activation: type[nn.Module], rng: dr.random.Generator
+) -> nn.Sequential:
     """A perceptron with ``hidden`` layers of ``width`` and five linear outputs, with random weights."""
     modules = []
     for _ in range(hidden):

@@ -12,8 +12,9 @@ from ..views import PinholeViews
 _LEVELS = 24
 
 
-def fused_distance(points: mi.Point3f, views: PinholeViews, depths: list[np.ndarray], *, truncation: float,
-                   share: float) -> mi.Float:
+def fused_distance(
+    points: mi.Point3f, views: PinholeViews, depths: list[np.ndarray], *, truncation: float, share: float
+) -> mi.Float:
     """Signed distance to what is not empty at ``points``, negative inside.
 
     Each view says how far a point lies before (positive) or behind (negative) what the view sees along the
@@ -48,13 +49,17 @@ def fused_distance(points: mi.Point3f, views: PinholeViews, depths: list[np.ndar
         stored = mi.Float(np.where(np.isnan(depth), -1, np.minimum(depth, 1e6)).astype(np.float32).ravel())
         stride = dr.opaque(mi.Int32, width)
         corner = row * stride + column
-        near = [dr.gather(mi.Float, stored, corner + down * stride + right, framed)
-                for down in (0, 1) for right in (0, 1)]
+        near = [
+            dr.gather(mi.Float, stored, corner + down * stride + right, framed)
+            for down in (0, 1)
+            for right in (0, 1)
+        ]
         least, most = near[0], near[0]
         for value in near[1:]:
             least, most = dr.minimum(least, value), dr.maximum(most, value)
-        between = ((1 - part[1]) * ((1 - part[0]) * near[0] + part[0] * near[1])
-                   + part[1] * ((1 - part[0]) * near[2] + part[0] * near[3]))
+        between = (1 - part[1]) * ((1 - part[0]) * near[0] + part[0] * near[1]) + part[1] * (
+            (1 - part[0]) * near[2] + part[0] * near[3]
+        )
         seen = dr.select(most - least < limit, between, least)
         vote = (seen - dr.norm(points - mi.Point3f(views.origins[index]))) / limit
         told = framed & (least >= 0) & (vote > -1)

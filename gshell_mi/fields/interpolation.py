@@ -20,8 +20,11 @@ class Interpolation:
 
     def __init__(self, field: mi.Float, lattice: Lattice):
         channels = dr.width(field) // lattice.vertex_count
-        self._within = (_InTetrahedra(field, lattice, channels) if isinstance(lattice, BccLattice)
-                        else _InCubes(field, lattice, channels))
+        self._within = (
+            _InTetrahedra(field, lattice, channels)
+            if isinstance(lattice, BccLattice)
+            else _InCubes(field, lattice, channels)
+        )
 
     def __call__(self, points: mi.Point3f) -> mi.Float:
         """The values at points in lattice units, channels interleaved."""
@@ -34,11 +37,12 @@ class Interpolation:
 
 class _InCubes:
     def __init__(self, field: mi.Float, lattice: Lattice, channels: int):
-        self._grid, = lattice.grids
+        (self._grid,) = lattice.grids
         n = self._grid.stride
         # Without the texture units of a GPU, whose weights have 8 bits.
-        self._texture = mi.Texture3f(mi.TensorXf(field, (n, n, n, channels)), use_accel=False,
-                                     wrap_mode=dr.WrapMode.Clamp)
+        self._texture = mi.Texture3f(
+            mi.TensorXf(field, (n, n, n, channels)), use_accel=False, wrap_mode=dr.WrapMode.Clamp
+        )
 
     def channels(self, points: mi.Point3f) -> list[mi.Float]:
         cells = (points - self._grid.origin) / self._grid.spacing
@@ -58,12 +62,23 @@ class _InTetrahedra:
         lowest = dr.floor(along)
         fractions = list(along - lowest)
         base = mi.Vector3i(lowest)
-        rank = [sum(dr.select((other > own) | ((other == own) & (j < i)), mi.UInt32(1), 0)
-                    for j, other in enumerate(fractions) if j != i) for i, own in enumerate(fractions)]
-        descending = [sum(dr.select(rank[i] == place, fractions[i], 0) for i in range(3))
-                      for place in range(3)]
-        weights = [1 - descending[0], descending[0] - descending[1], descending[1] - descending[2],
-                   descending[2]]
+        rank = [
+            sum(
+                dr.select((other > own) | ((other == own) & (j < i)), mi.UInt32(1), 0)
+                for j, other in enumerate(fractions)
+                if j != i
+            )
+            for i, own in enumerate(fractions)
+        ]
+        descending = [
+            sum(dr.select(rank[i] == place, fractions[i], 0) for i in range(3)) for place in range(3)
+        ]
+        weights = [
+            1 - descending[0],
+            descending[0] - descending[1],
+            descending[1] - descending[2],
+            descending[2],
+        ]
         total = [mi.Float(0) for _ in range(self._channels)]
         for step, weight in enumerate(weights):
             i, j, k = (base[axis] + dr.select(rank[axis] < step, mi.Int32(1), 0) for axis in range(3))

@@ -65,8 +65,9 @@ class LatticeFields:
 
         def sdf(blocks: BlockLattice) -> mi.Float:
             if blocks.vertex_count != self.sdf.size:
-                raise UserError(f"sdf has {self.sdf.size} values, but its blocks have {blocks.vertex_count} "
-                                f"vertices")
+                raise UserError(
+                    f"sdf has {self.sdf.size} values, but its blocks have {blocks.vertex_count} vertices"
+                )
             return mi.Float(self.sdf)
 
         return BlockLattice(make_lattice(self.grid, self.block_resolution), mi.UInt32(self.blocks), sdf)
@@ -85,8 +86,10 @@ class LatticeFields:
             UserError: the fields are stored in blocks, hence unknown elsewhere.
         """
         if self.blocks is not None:
-            raise UserError("fields in blocks are known near their surface only and cannot be resampled; "
-                            "from_mesh makes fields of any resolution from the extracted mesh")
+            raise UserError(
+                "fields in blocks are known near their surface only and cannot be resampled; "
+                "from_mesh makes fields of any resolution from the extracted mesh"
+            )
         old, new = self.lattice, make_lattice(grid or self.grid, resolution)
         if new == old:
             return LatticeFields(self.sdf, self.msdf, self.deform, self.grid)
@@ -111,8 +114,12 @@ class LatticeFields:
             resampled = self._resampler(new)
             blocks = BlockLattice.around(new, lambda points: resampled(points)["sdf"], mi.Float)
             fields = resampled(blocks.points(mi.Float))
-        return LatticeFields(**{name: field.numpy() for name, field in fields.items()}, grid=self.grid,
-                             blocks=blocks.blocks.numpy(), block_resolution=new.resolution)
+        return LatticeFields(
+            **{name: field.numpy() for name, field in fields.items()},
+            grid=self.grid,
+            blocks=blocks.blocks.numpy(),
+            block_resolution=new.resolution,
+        )
 
     def whole(self) -> LatticeFields:
         """Fields in blocks on all of their lattice, with neutral weights: elsewhere as at the nearest stored
@@ -127,8 +134,9 @@ class LatticeFields:
         # Values at the edge of the blocks may have drifted; on which side it is has not.
         inside = is_set(lattice.signs(sdf), dr.arange(mi.UInt32, lattice.vertex_count))
         sdf = dr.select(inside, -dr.abs(sdf), dr.abs(sdf))
-        sdf, msdf, deform = (lattice.spread_out(field).numpy()
-                             for field in (sdf, mi.Float(self.msdf), mi.Float(self.deform)))
+        sdf, msdf, deform = (
+            lattice.spread_out(field).numpy() for field in (sdf, mi.Float(self.msdf), mi.Float(self.deform))
+        )
         return LatticeFields(sdf, msdf, deform, self.grid)
 
     def _resampler(self, lattice: Lattice) -> Callable[[mi.Point3f], dict[str, mi.Float]]:
@@ -140,8 +148,7 @@ class LatticeFields:
 
         own = self.lattice
         assert isinstance(own, Lattice), "what is stored in blocks is not resampled"
-        at = {name: Interpolation(mi.Float(getattr(self, name)), own)
-              for name in ("sdf", "msdf", "deform")}
+        at = {name: Interpolation(mi.Float(getattr(self, name)), own) for name in ("sdf", "msdf", "deform")}
 
         def offset(vertices: mi.Point3f) -> mi.Vector3f:
             return self.lattice.max_offset * mi.Vector3f(at["deform"].channels(vertices))
@@ -188,8 +195,14 @@ class LatticeFields:
             except UserError as error:
                 raise UserError(f"{path}: sdf does not fit: {error}") from None
         closed = cls.closed(sdf, grid)
-        fields = cls(sdf, arrays.get("msdf", closed.msdf), arrays.get("deform", closed.deform), grid,
-                     blocks=blocks, block_resolution=block_resolution)
+        fields = cls(
+            sdf,
+            arrays.get("msdf", closed.msdf),
+            arrays.get("deform", closed.deform),
+            grid,
+            blocks=blocks,
+            block_resolution=block_resolution,
+        )
         if "weights" in arrays and fields.lattice.weight_count:
             fields = replace(fields, weights=arrays["weights"])
         sizes = {"msdf": sdf.size, "deform": 3 * sdf.size, "weights": fields.lattice.weight_count}
@@ -204,11 +217,16 @@ def _arrays_of(path: str | Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path) as archive:
             names = [name for name in _ARRAYS if name in archive.files]
-            unpacked = sum(entry.file_size for entry in archive.zip.infolist()
-                           if entry.filename.removesuffix(".npy") in names)
+            unpacked = sum(
+                entry.file_size
+                for entry in archive.zip.infolist()
+                if entry.filename.removesuffix(".npy") in names
+            )
             memory.require(2 * unpacked, memory.free_memory(), f"The archive {path}", "give another")
-            arrays = {name: archive[name].ravel().astype(np.float32 if name in _ARRAYS[:4] else np.float64)
-                      for name in names}
+            arrays = {
+                name: archive[name].ravel().astype(np.float32 if name in _ARRAYS[:4] else np.float64)
+                for name in names
+            }
             found = ", ".join(archive.files) or "none"
     except UserError:
         raise
@@ -228,8 +246,13 @@ def _checked_blocks(arrays: dict[str, np.ndarray], grid: str, path: str | Path) 
     if resolution.size != 1 or resolution[0] not in range(1, MOST_CELLS + 1):
         raise UserError(f"{path}: has blocks, but no block_resolution from 1 to {MOST_CELLS}")
     count = block_count(make_lattice(grid, int(resolution[0])))
-    if len(blocks) == 0 or (np.diff(blocks) <= 0).any() or (blocks % 1).any() or blocks[0] < 0 or (
-            blocks[-1] >= count):
+    if (
+        len(blocks) == 0
+        or (np.diff(blocks) <= 0).any()
+        or (blocks % 1).any()
+        or blocks[0] < 0
+        or (blocks[-1] >= count)
+    ):
         raise UserError(f"{path}: its blocks are not ascending whole numbers below {count}")
     return blocks.astype(np.uint32), int(resolution[0])
 

@@ -52,8 +52,9 @@ def mask_distance(alpha: np.ndarray, *, fill_holes: bool = True, thin_parts: boo
     if not contours:
         return np.full(alpha.shape, -np.inf)
     steps = np.linspace(0.0, 1.0, _CONTOUR_SAMPLES, endpoint=False)[:, None, None]
-    samples = np.concatenate([((1 - steps) * contour[:-1] + steps * contour[1:]).reshape(-1, 2)
-                              for contour in contours])
+    samples = np.concatenate(
+        [((1 - steps) * contour[:-1] + steps * contour[1:]).reshape(-1, 2) for contour in contours]
+    )
     # Far from the outline the distance between pixel centres is accurate enough and much cheaper.
     distance = ndimage.distance_transform_edt(inside) + ndimage.distance_transform_edt(~inside) - 0.5
     near = distance < _NEAR

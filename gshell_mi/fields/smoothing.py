@@ -88,11 +88,11 @@ class LatticeDiffusion:
         diffused = []
         # Four values that lie side by side are gathered in twice the time of one, three in five times.
         for first in range(0, len(columns), 4):
-            group = columns[first:first + 4]
+            group = columns[first : first + 4]
             kind = (mi.Float, mi.Vector2f, mi.Vector4f, mi.Vector4f)[len(group) - 1]
             padding = [mi.Float(0)] if len(group) == 3 else []
             solution = self._diffused(kind, dr.ravel(kind(*group, *padding)), smoothing)
-            diffused += [solution] if kind is mi.Float else list(dr.unravel(kind, solution))[:len(group)]
+            diffused += [solution] if kind is mi.Float else list(dr.unravel(kind, solution))[: len(group)]
         found = iter(diffused)
         return {name: self._with_columns(field, found) for name, field in fields.items()}
 
@@ -181,8 +181,9 @@ class MeshDiffusion:
         system = (eye(vertex_count) + smoothing * mesh_laplacian(faces, vertex_count)).tocoo()
         self.count = vertex_count
         # Dr.Jit's arrays tell where to solve: on the CPU or the GPU.
-        self._solver = CholeskySolverF(vertex_count, mi.Int32(system.row), mi.Int32(system.col),
-                                       mi.Float64(system.data), MatrixType.COO)
+        self._solver = CholeskySolverF(
+            vertex_count, mi.Int32(system.row), mi.Int32(system.col), mi.Float64(system.data), MatrixType.COO
+        )
 
     def __call__(self, values: mi.Float) -> mi.Float:
         """Diffuses a flat field of one value, or of interleaved channels, per vertex."""
@@ -194,8 +195,11 @@ class MeshDiffusion:
             return {}
         channels = {name: dr.width(field) // self.count for name, field in fields.items()}
         vertex = dr.arange(mi.UInt32, self.count)
-        columns = [dr.gather(mi.Float, field, vertex * channels[name] + channel)
-                   for name, field in fields.items() for channel in range(channels[name])]
+        columns = [
+            dr.gather(mi.Float, field, vertex * channels[name] + channel)
+            for name, field in fields.items()
+            for channel in range(channels[name])
+        ]
         shape = (self.count, len(columns))
         solution = dr.empty(mi.TensorXf, shape=shape)
         self._solver.solve(mi.TensorXf(dr.ravel(mi.ArrayXf(columns), order="F"), shape), solution)

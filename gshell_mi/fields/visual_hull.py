@@ -13,8 +13,14 @@ from ..views import PinholeViews
 from .mask_outline import mask_distance, sharp
 
 
-def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray], *,
-                daylight_votes: float = 0.06, progress: Callable[[], object] | None = None) -> mi.Float:
+def visual_hull(
+    points: mi.Point3f,
+    views: PinholeViews,
+    alphas: list[np.ndarray],
+    *,
+    daylight_votes: float = 0.06,
+    progress: Callable[[], object] | None = None,
+) -> mi.Float:
     """Signed distance to the visual hull at ``points``, negative inside.
 
     Each view bounds the object by the cone over its mask; the hull is their intersection, the
@@ -37,9 +43,15 @@ def visual_hull(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray
     return doubting_hulls(points, views, alphas, [0], daylight_votes=daylight_votes, progress=progress)[0]
 
 
-def doubting_hulls(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndarray],
-                   disbelieved: Sequence[int], *, daylight_votes: float = 0.06,
-                   progress: Callable[[], object] | None = None) -> list[mi.Float]:
+def doubting_hulls(
+    points: mi.Point3f,
+    views: PinholeViews,
+    alphas: list[np.ndarray],
+    disbelieved: Sequence[int],
+    *,
+    daylight_votes: float = 0.06,
+    progress: Callable[[], object] | None = None,
+) -> list[mi.Float]:
     """Signed distances to hulls that do not believe so many masks: at each point those that it is farthest
     outside of.
 
@@ -51,8 +63,10 @@ def doubting_hulls(points: mi.Point3f, views: PinholeViews, alphas: list[np.ndar
     votes = max(2, round(daylight_votes * len(views)))
     # The largest distances to the filled masks, and to the unfilled ones, sorted: the last one has as many
     # supporters as there are.
-    carved, daylight = ([dr.full(mi.Float, -dr.inf, dr.width(points)) for _ in range(count)]
-                        for count in (1 + max(disbelieved), votes))
+    carved, daylight = (
+        [dr.full(mi.Float, -dr.inf, dr.width(points)) for _ in range(count)]
+        for count in (1 + max(disbelieved), votes)
+    )
     for index, alpha in enumerate(alphas):
         whole = not _touches_border(alpha)
         outline = mask_distance(alpha, thin_parts=thin_parts)
@@ -79,8 +93,9 @@ def _touches_border(alpha: np.ndarray) -> bool:
     return bool(max(alpha[[0, -1]].max(), alpha[:, [0, -1]].max()) >= 0.5)
 
 
-def _cone_distance(points: mi.Point3f, views: PinholeViews, index: int, outline: np.ndarray,
-                   whole: bool) -> mi.Float:
+def _cone_distance(
+    points: mi.Point3f, views: PinholeViews, index: int, outline: np.ndarray, whole: bool
+) -> mi.Float:
     """Distance to the cone over a mask, to first order.
 
     Where the view does not frame a point it is -inf, unless the view shows the ``whole`` object: then
@@ -90,8 +105,10 @@ def _cone_distance(points: mi.Point3f, views: PinholeViews, index: int, outline:
     film, depth = views.project(index, points)
     # A finite stand-in keeps the interpolation next to an empty mask free of NaN.
     diagonal = float(np.hypot(width, height))
-    texture = mi.Texture2f(mi.TensorXf(np.clip(outline, -diagonal, diagonal)[..., None].astype(np.float32)),
-                           wrap_mode=dr.WrapMode.Clamp)
+    texture = mi.Texture2f(
+        mi.TensorXf(np.clip(outline, -diagonal, diagonal)[..., None].astype(np.float32)),
+        wrap_mode=dr.WrapMode.Clamp,
+    )
     pixel = float(np.linalg.norm(views.bases[index][:, 0]) / width)
     distance = texture.eval(film)[0] * depth * pixel
     if whole:

@@ -56,9 +56,16 @@ def main(arguments: list[str] | None = None) -> int:
     # Other defaults, which the rest of the words are parsed against.
     effort = _effort(words)
     default = _Arguments(scene=tyro.MISSING, effort=effort, config=EFFORTS[effort])
-    return run_command("fit", "Reconstruct an open or closed surface, its material and its light.",
-                       _Arguments, _fit, arguments, default=default, interrupted=_how_to_continue,
-                       check=check_flags)
+    return run_command(
+        "fit",
+        "Reconstruct an open or closed surface, its material and its light.",
+        _Arguments,
+        _fit,
+        arguments,
+        default=default,
+        interrupted=_how_to_continue,
+        check=check_flags,
+    )
 
 
 def _effort(words: list[str]) -> str:
@@ -79,16 +86,25 @@ def _fit(given: _Arguments) -> None:
         if given.viewer:
             viewer = stack.enter_context(Viewer(given.viewer_port))
             print(f"live view: {viewer.url}", file=sys.stderr)
-        result = fit_scene(given.scene, given.output, targets=given.targets, config=given.config,
-                           resume=given.resume, overwrite=given.overwrite,
-                           report=not (given.no_report or given.effort == "preview"), quiet=given.quiet,
-                           observer=viewer)
+        result = fit_scene(
+            given.scene,
+            given.output,
+            targets=given.targets,
+            config=given.config,
+            resume=given.resume,
+            overwrite=given.overwrite,
+            report=not (given.no_report or given.effort == "preview"),
+            quiet=given.quiet,
+            observer=viewer,
+        )
     counts = result.metrics["counts"]
-    print(f"{result.output}: {counts['vertices']} vertices, {counts['faces']} faces, "
-          f"{counted(counts['boundary_loops'], 'boundary loop')}, "
-          f"{counted(counts['components'], 'component')}, "
-          f"{result.metrics['psnr_training']:.2f} dB on the training views, "
-          f"{result.metrics['seconds']['total']:.0f} s")
+    print(
+        f"{result.output}: {counts['vertices']} vertices, {counts['faces']} faces, "
+        f"{counted(counts['boundary_loops'], 'boundary loop')}, "
+        f"{counted(counts['components'], 'component')}, "
+        f"{result.metrics['psnr_training']:.2f} dB on the training views, "
+        f"{result.metrics['seconds']['total']:.0f} s"
+    )
     if "held_out" in result.metrics:
         print(f"held-out views: {scores_line(result.metrics['held_out'])}")
 

@@ -48,9 +48,18 @@ class FitResult:
     metrics: dict
 
 
-def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: str | Path | None = None,
-              config: FitConfig | None = None, resume: bool = False, overwrite: bool = False,
-              report: bool = True, quiet: bool = True, observer: Observer | None = None) -> FitResult:
+def fit_scene(
+    scene: str | Path,
+    output: str | Path | None = None,
+    *,
+    targets: str | Path | None = None,
+    config: FitConfig | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    report: bool = True,
+    quiet: bool = True,
+    observer: Observer | None = None,
+) -> FitResult:
     """Reconstructs the gshell shape of a fit scene, its material and its light.
 
     A Mitsuba ``llvm`` or ``cuda`` variant must be set.
@@ -73,20 +82,31 @@ def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: s
     check_names(config)
     scene = Path(scene)
     output = Path(output) if output else default_output(scene)
-    with (Interrupt() as interrupt, Progress(quiet=quiet) as progress,
-          FitFolder(output, resume=resume, overwrite=overwrite) as folder):
+    with (
+        Interrupt() as interrupt,
+        Progress(quiet=quiet) as progress,
+        FitFolder(output, resume=resume, overwrite=overwrite) as folder,
+    ):
         checkpoint = Checkpoint("", 0, config.settings())
         if resume:
             checkpoint = Checkpoint.load(checkpoint_path(folder.place))
             _check_settings(checkpoint.config, config.settings())
         memory = _Memory(config, report, progress)
         with progress.stage("targets", None):
-            loaded = load_fit_scene(scene, Path(targets) if targets else None, hold_out=config.hold_out,
-                                    before_targets=memory.check, on_reference=progress.reference)
+            loaded = load_fit_scene(
+                scene,
+                Path(targets) if targets else None,
+                hold_out=config.hold_out,
+                before_targets=memory.check,
+                on_reference=progress.reference,
+            )
             fit = Fit(loaded, config, Lattices.of(loaded.subject, config))
             _check_inputs(fit, checkpoint, resume)
-            folder.check(scene_inputs(scene) | loaded.target_files, fit.views.ids,
-                         [view.sensor.id() for view in loaded.held_out])
+            folder.check(
+                scene_inputs(scene) | loaded.target_files,
+                fit.views.ids,
+                [view.sensor.id() for view in loaded.held_out],
+            )
         if not fit.pixels.has_alpha:
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
         for note in loaded.notes:
@@ -103,9 +123,11 @@ def fit_scene(scene: str | Path, output: str | Path | None = None, *, targets: s
             metrics = _export(fit, surface, runner, memory, report)
             folder.finish()
         except OSError as error:
-            raise UserError(f"'{error.filename or folder.place}' cannot be written "
-                            f"({error.strerror or error}); free some space or mend its permissions, then "
-                            f"continue with --resume.") from error
+            raise UserError(
+                f"'{error.filename or folder.place}' cannot be written "
+                f"({error.strerror or error}); free some space or mend its permissions, then "
+                f"continue with --resume."
+            ) from error
         return FitResult(output, metrics)
 
 
@@ -122,8 +144,9 @@ class _Memory:
         lattices = Lattices.of(subject, self._config)
         volume = self._config.volume.iterations and not subject.filename
         lattice = lattices.fine if volume else lattices.last
-        estimate = MemoryEstimate.of(self._config, lattice.resolution, sizes, grid=lattice.grid,
-                                     report=self._report)
+        estimate = MemoryEstimate.of(
+            self._config, lattice.resolution, sizes, grid=lattice.grid, report=self._report
+        )
         free = free_memory_of_variant()
         told = "" if free is None else f"; {free / GIB:.1f} GiB are free"
         self._progress.tell(f"memory: about {estimate.total / GIB:.1f} GiB{told}")
@@ -149,8 +172,10 @@ def _check_inputs(fit: Fit, checkpoint: Checkpoint, resume: bool) -> None:
 def _check_settings(before: dict[str, Any], now: dict[str, Any]) -> None:
     for name, value in now.items():
         if before.get(name) != value and name != "checkpoint_seconds":
-            raise UserError(f"The checkpoint was made with {name} = {before.get(name)}, not {value}; "
-                            f"resume with the same settings or start again with --overwrite.")
+            raise UserError(
+                f"The checkpoint was made with {name} = {before.get(name)}, not {value}; "
+                f"resume with the same settings or start again with --overwrite."
+            )
 
 
 def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report: bool) -> dict:
@@ -159,9 +184,17 @@ def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report:
     with progress.stage("export", None), runner.timed("export"):
         fit = fit.corrected(dataclasses.replace(surface, gains=None))
         fitted = Fitted.of(fit, surface)
-        metrics = export_fit(output, fit.scene, fitted.material, fitted.light, fit.config.triptychs,
-                             fitted.texture, fitted.texture_levels,
-                             light_turns=fit.config.light_frame == "camera", gains=surface.gains)
+        metrics = export_fit(
+            output,
+            fit.scene,
+            fitted.material,
+            fitted.light,
+            fit.config.triptychs,
+            fitted.texture,
+            fitted.texture_levels,
+            light_turns=fit.config.light_frame == "camera",
+            gains=surface.gains,
+        )
         metrics["config"] = dataclasses.asdict(fit.config)
         metrics |= fitted.findings(fit, progress.warn) | {"warnings": progress.warnings}
 

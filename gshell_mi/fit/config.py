@@ -177,19 +177,40 @@ class FitConfig:
 Effort = Literal["preview", "normal", "thorough"]
 
 #: Less of everything, but for the steps that openings need: a rough result in half a minute.
-_PREVIEW = {"resolution": 48, "iterations": 70, "triptychs": 4, "radiance.batch": 16384,
-            "occlusion.most": 0.0, "openings.iterations": 600, "openings.rounds": 0, "cavities.iterations": 0,
-            "refinement.iterations": 0, "volume.iterations": 0, "render.views": 1, "render.primal_spp": 4,
-            "render.max_depth": 2, "model.even_start": False, "model.light_height": 16, "texture.rounds": 1,
-            "joint.color_hold": 0.0, "openings.revise": False}
+_PREVIEW = {
+    "resolution": 48,
+    "iterations": 70,
+    "triptychs": 4,
+    "radiance.batch": 16384,
+    "occlusion.most": 0.0,
+    "openings.iterations": 600,
+    "openings.rounds": 0,
+    "cavities.iterations": 0,
+    "refinement.iterations": 0,
+    "volume.iterations": 0,
+    "render.views": 1,
+    "render.primal_spp": 4,
+    "render.max_depth": 2,
+    "model.even_start": False,
+    "model.light_height": 16,
+    "texture.rounds": 1,
+    "joint.color_hold": 0.0,
+    "openings.revise": False,
+}
 
 #: Twice as many steps of every stage, and twice as fine an end of what is too thin for hulls.
-_THOROUGH = {name: 2 * value for name, value in FitConfig().settings().items()
-             if name.split(".")[-1] == "iterations" or name == "volume.detail_resolution"}
+_THOROUGH = {
+    name: 2 * value
+    for name, value in FitConfig().settings().items()
+    if name.split(".")[-1] == "iterations" or name == "volume.detail_resolution"
+}
 
 #: The settings of each effort.
-EFFORTS: dict[str, FitConfig] = {"preview": FitConfig().changed(_PREVIEW), "normal": FitConfig(),
-                                 "thorough": FitConfig().changed(_THOROUGH)}
+EFFORTS: dict[str, FitConfig] = {
+    "preview": FitConfig().changed(_PREVIEW),
+    "normal": FitConfig(),
+    "thorough": FitConfig().changed(_THOROUGH),
+}
 
 
 def default_output(scene: Path) -> Path:

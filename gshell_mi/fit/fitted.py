@@ -48,8 +48,13 @@ class Fitted:
             material = MaterialField(np.zeros((count, 3)), **given)
             material.parameters = {name: mi.Float(surface.model[name]) for name in material.parameters}
         light, model = start_light(fit.scene, surface, config), surface.model
-        return cls(material, light, model.get("texture"), int(model.get("texture_levels", 0)),
-                   optimised_scene(fit.scene, light))
+        return cls(
+            material,
+            light,
+            model.get("texture"),
+            int(model.get("texture_levels", 0)),
+            optimised_scene(fit.scene, light),
+        )
 
     def findings(self, fit: Fit, warn: Callable[[str], None]) -> dict:
         """Entries of ``metrics.json``: ``diagnostics`` and, with depth maps, ``depth_error``.

@@ -10,41 +10,94 @@ from ..errors import UserError
 _MOVED = {
     "": {"preview": "effort preview"},
     "lattice": {name: name for name in ("start-resolution", "band-resolution")},
-    "topology": {"ghost-min-area": "min-area"} | {name: name for name in ("min-area", "unseen-area",
-                                                                         "sheet-thickness")},
+    "topology": {"ghost-min-area": "min-area"}
+    | {name: name for name in ("min-area", "unseen-area", "sheet-thickness")},
     "hull": {"hull-daylight-votes": "daylight-votes"},
-    "radiance": {"ghost-batch": "batch", "ghost-sheets": "layers", "ghost-lr": "lr",
-                 "ghost-smoothing": "smoothing"},
-    "openings": {f"ghost-{name}": name for name in ("iterations", "mask", "daylight", "binary", "closing",
-                                                    "chroma", "rounds")},
+    "radiance": {
+        "ghost-batch": "batch",
+        "ghost-sheets": "layers",
+        "ghost-lr": "lr",
+        "ghost-smoothing": "smoothing",
+    },
+    "openings": {
+        f"ghost-{name}": name
+        for name in ("iterations", "mask", "daylight", "binary", "closing", "chroma", "rounds")
+    },
     "cavities": {f"carving-{name}": name for name in ("iterations", "batch", "lr", "radiance-lr")},
-    "refinement": {f"refinement-{name}": name for name in ("iterations", "lr", "smoothing", "detail",
-                                                           "radiance-lr", "outline")},
+    "refinement": {
+        f"refinement-{name}": name
+        for name in ("iterations", "lr", "smoothing", "detail", "radiance-lr", "outline")
+    },
     "folds": {f"folds-{name}": name for name in ("iterations", "lr", "detail", "descent")},
-    "volume": {f"volume-{name}": name for name in ("iterations", "side", "resolution", "batch", "density-lr",
-                                                   "radiance-lr", "direction-lr", "mask", "distortion")},
-    "render": {"step-views": "views"} | {name: name for name in ("spp", "primal-spp", "max-depth",
-                                                                 "gradient-depth", "reparam-depth")},
+    "volume": {
+        f"volume-{name}": name
+        for name in (
+            "iterations",
+            "side",
+            "resolution",
+            "batch",
+            "density-lr",
+            "radiance-lr",
+            "direction-lr",
+            "mask",
+            "distortion",
+        )
+    },
+    "render": {"step-views": "views"}
+    | {name: name for name in ("spp", "primal-spp", "max-depth", "gradient-depth", "reparam-depth")},
     "model": {name: name for name in ("field", "light-height")}
-             | {"flexicubes-weights": "field flexicubes", "no-even-start": "no-even-start"},
+    | {"flexicubes-weights": "field flexicubes", "no-even-start": "no-even-start"},
     "losses": {"image-loss": "image", "joint-mask": "mask", "joint-depth": "depth"}
-              | {name: name for name in ("material-smoothness", "light-grey", "flexicubes-deviation")}
-              | {name: f"extra {name.replace('-', '_')}" for name in (
-                  "hole-opening", "hole-closing", "visible-outside", "visible-inside", "sdf-sign", "eikonal",
-                  "template-smoothness", "albedo-chroma", "light-smoothness")},
+    | {name: name for name in ("material-smoothness", "light-grey", "flexicubes-deviation")}
+    | {
+        name: f"extra {name.replace('-', '_')}"
+        for name in (
+            "hole-opening",
+            "hole-closing",
+            "visible-outside",
+            "visible-inside",
+            "sdf-sign",
+            "eikonal",
+            "template-smoothness",
+            "albedo-chroma",
+            "light-smoothness",
+        )
+    },
     "joint": {"material-gradient-smoothing": "material-smoothing"}
-             | {name: name for name in ("warmup", "geometry-lr", "msdf-lr", "deform-lr", "geometry-smoothing",
-                                        "geometry-detail", "material-lr", "color-hold", "light-lr")},
+    | {
+        name: name
+        for name in (
+            "warmup",
+            "geometry-lr",
+            "msdf-lr",
+            "deform-lr",
+            "geometry-smoothing",
+            "geometry-detail",
+            "material-lr",
+            "color-hold",
+            "light-lr",
+        )
+    },
     "detail": {"detail-iterations": "iterations"},
 }
 
 #: Flags that nothing has taken the place of.
-GONE = ("color-voxels", "ghost-gain", "vessel-gain", "refinement-gain", "folds-gain", "second-look",
-        "second-look-gain", "joint.revision", "joint.revision-gain")
+GONE = (
+    "color-voxels",
+    "ghost-gain",
+    "vessel-gain",
+    "refinement-gain",
+    "folds-gain",
+    "second-look",
+    "second-look-gain",
+    "joint.revision",
+    "joint.revision-gain",
+)
 
 #: The new flag of each old one, without dashes.
-RENAMED = {old: f"{group}.{new}" if group else new for group, names in _MOVED.items()
-           for old, new in names.items()}
+RENAMED = {
+    old: f"{group}.{new}" if group else new for group, names in _MOVED.items() for old, new in names.items()
+}
 
 
 def check_flags(words: Iterable[str]) -> None:

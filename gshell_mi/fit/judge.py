@@ -93,8 +93,10 @@ class Verdict:
 
     def facts(self) -> dict[str, list[float]]:
         """For ``metrics.json``: gain and noise of each place."""
-        return {"gain": [round(float(value), 5) for value in self.gain],
-                "noise": [round(float(value), 5) if np.isfinite(value) else -1.0 for value in self.noise]}
+        return {
+            "gain": [round(float(value), 5) for value in self.gain],
+            "noise": [round(float(value), 5) if np.isfinite(value) else -1.0 for value in self.noise],
+        }
 
 
 class Judge:
@@ -114,8 +116,15 @@ class Judge:
         seed: of the random pixels.
     """
 
-    def __init__(self, views: PinholeViews, targets: list[Target],
-                 splits: list[tuple[np.ndarray, np.ndarray]], *, batch: int, seed: int = 0):
+    def __init__(
+        self,
+        views: PinholeViews,
+        targets: list[Target],
+        splits: list[tuple[np.ndarray, np.ndarray]],
+        *,
+        batch: int,
+        seed: int = 0,
+    ):
         self.views, self.targets, self.splits = views, targets, splits
         self.batch, self.seed = batch, seed
 
@@ -128,15 +137,21 @@ class Judge:
     @cached_property
     def _pools(self) -> list[tuple[PixelPool, PixelPool]]:
         """Pixels that tell the colours, and those that judge."""
-        return [(PixelPool(self.views, self.targets, known),
-                 PixelPool(self.views, self.targets, unknown, _OUTLINE)) for known, unknown in self.splits]
+        return [
+            (
+                PixelPool(self.views, self.targets, known),
+                PixelPool(self.views, self.targets, unknown, _OUTLINE),
+            )
+            for known, unknown in self.splits
+        ]
 
     def shown(self, mesh: Mesh, like: Shown | None = None) -> Shown:
         """A mesh as the images show it, once for each of the splits; it may mirror what another one does."""
         return Shown(mesh, self.views, self._pools, batch=self.batch, seed=self.seed, like=like)
 
-    def compare(self, before: Part, after: Part, label: np.ndarray | None = None,
-                where: Shown | None = None) -> Verdict:
+    def compare(
+        self, before: Part, after: Part, label: np.ndarray | None = None, where: Shown | None = None
+    ) -> Verdict:
         """Judges a change.
 
         Args:
@@ -151,9 +166,16 @@ class Judge:
         with dr.suspend_grad():
             for split in range(len(self.splits)):
                 looks = [
-                    _Look.of(pixel, place, *(part.look(pixel, split, first if part.shown is where else None)
-                                             for part in (before, after)))
-                    for pixel, place, first in self._judging(split, label, where)]
+                    _Look.of(
+                        pixel,
+                        place,
+                        *(
+                            part.look(pixel, split, first if part.shown is where else None)
+                            for part in (before, after)
+                        ),
+                    )
+                    for pixel, place, first in self._judging(split, label, where)
+                ]
                 if looks:
                     self._add_errors(sums, joined_lanes(looks), counts, split)
         rays, *errors = (total.numpy().reshape(places, -1) for total in sums)
@@ -163,8 +185,9 @@ class Judge:
         """Judges one change of the whole surface."""
         return self.compare(self.shown(before).whole, self.shown(after).whole)
 
-    def _judging(self, split: int, label: np.ndarray | None,
-                 where: Shown) -> Iterator[tuple[PixelSample, mi.UInt32, Met | None]]:
+    def _judging(
+        self, split: int, label: np.ndarray | None, where: Shown
+    ) -> Iterator[tuple[PixelSample, mi.UInt32, Met | None]]:
         """Pixels that judge, the place that they judge, and where their rays meet a mesh first if that tells
         which it is."""
         if label is None:
@@ -190,12 +213,16 @@ class Judge:
         """Adds rays, and errors of pixels and of blocks, before and after, to those of places in views."""
         count, block = look.blocks(counts)
         rays = _group_sums(mi.Float(1), count, block)
-        target, *seen = (_group_sums(value, count, block) / rays
-                         for value in (look.target, look.before, look.after))
+        target, *seen = (
+            _group_sums(value, count, block) / rays for value in (look.target, look.before, look.after)
+        )
         at = look.place * dr.opaque(mi.UInt32, len(self.views)) + look.view
         one = dr.full(mi.Float, 1, dr.width(at))
-        added = [one, *(self._error(split, value, look.target) for value in (look.before, look.after)),
-                 *(dr.gather(mi.Float, self._error(split, mean, target), block) for mean in seen)]
+        added = [
+            one,
+            *(self._error(split, value, look.target) for value in (look.before, look.after)),
+            *(dr.gather(mi.Float, self._error(split, mean, target), block) for mean in seen),
+        ]
         for total, value in zip(sums, added, strict=True):
             dr.scatter_reduce(dr.ReduceOp.Add, total, value, at)
         dr.eval(sums)
@@ -229,8 +256,12 @@ class _Look:
     @classmethod
     def of(cls, pixel: PixelSample, place: mi.UInt32, *seen: tuple[mi.Color3f, mi.Float]) -> _Look:
         """Of pixels that judge places, and radiance and coverage seen before and after."""
-        return cls(pixel.view, pixel.film, place, *(
-            mi.Vector4f(*radiance, alpha) for radiance, alpha in ((pixel.radiance, pixel.alpha), *seen)))
+        return cls(
+            pixel.view,
+            pixel.film,
+            place,
+            *(mi.Vector4f(*radiance, alpha) for radiance, alpha in ((pixel.radiance, pixel.alpha), *seen)),
+        )
 
     def blocks(self, counts: mi.Vector2f) -> tuple[int, mi.UInt32]:
         """Groups of the rays of one view and place that go through one block; ``counts`` of these per view.

@@ -49,8 +49,13 @@ class Lattices:
             coarse = min(coarse, config.lattice.start_resolution)
         volume = config.resolution or max(last.resolution, config.volume.resolution)
         fine = config.resolution or max(volume, config.volume.detail_resolution)
-        return cls(make_lattice(_EARLY_GRIDS[last.grid], coarse), make_lattice(last.grid, coarse), last,
-                   make_lattice(last.grid, volume), make_lattice(last.grid, fine))
+        return cls(
+            make_lattice(_EARLY_GRIDS[last.grid], coarse),
+            make_lattice(last.grid, coarse),
+            last,
+            make_lattice(last.grid, volume),
+            make_lattice(last.grid, fine),
+        )
 
     def end_of(self, surface: Surface) -> Lattice:
         """What a fit ends on, told by the lattice that its first joint stage was on."""

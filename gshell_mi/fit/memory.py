@@ -55,8 +55,9 @@ class MemoryEstimate:
     light: int
 
     @classmethod
-    def of(cls, config: FitConfig, resolution: int, sizes: np.ndarray, *,
-           grid: str = "tet", report: bool = True) -> MemoryEstimate:
+    def of(
+        cls, config: FitConfig, resolution: int, sizes: np.ndarray, *, grid: str = "tet", report: bool = True
+    ) -> MemoryEstimate:
         """Estimates it.
 
         Args:
@@ -89,9 +90,14 @@ class MemoryEstimate:
             targets=(_PER_PIXEL + corrected) * int(pixels.sum()),
             samples=memory.PER_SAMPLE * int(pixels.max()) * max(config.render.primal_spp, config.render.spp),
             volume=_PER_SQUARE_VOXEL * config.volume.side**2 if config.volume.iterations else 0,
-            rays=max(_PER_RAY * config.radiance.batch, _PER_RAY * config.cavities.batch,
-                     _PER_RAY * config.volume.batch, _PER_PLACE * config.cameras.places),
-            light=_PER_TEXEL * 2 * config.model.light_height**2)
+            rays=max(
+                _PER_RAY * config.radiance.batch,
+                _PER_RAY * config.cavities.batch,
+                _PER_RAY * config.volume.batch,
+                _PER_PLACE * config.cameras.places,
+            ),
+            light=_PER_TEXEL * 2 * config.model.light_height**2,
+        )
 
     @property
     def total(self) -> int:
@@ -109,7 +115,7 @@ class MemoryEstimate:
             "rays": "lower --radiance.batch, --cavities.batch, --volume.batch and --cameras.places",
             "light": "lower --model.light-height",
             "samples": "lower --render.primal-spp and --render.spp, or use smaller views (--max-size of the "
-                       "import)",
+            "import)",
         }
         largest = max(cures, key=lambda name: getattr(self, name))
         share = getattr(self, largest) / memory.GIB

@@ -30,37 +30,39 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
         config: the settings.
     """
     given = bool(scene.subject.filename)
-    start: list[Stage] = [Given()] if given else [
-        *([Occlusion(config.occlusion)] if config.occlusion.most else []),  # masks that are wrong
-        Hull(config.hull),                                              # what the masks leave
-    ]
+    start: list[Stage] = [Given()]
+    if not given:
+        start = [
+            *([Occlusion(config.occlusion)] if config.occlusion.most else []),  # masks that are wrong
+            Hull(config.hull),  # what the masks leave
+        ]
     found = config.exposures == "find" and not config.geometry_only
     exposures: list[Stage] = [Exposures(config.gains)] if found else []
     if given and not Given.is_closed(scene, lattices, config):
-        start += exposures                                          # a gain for each view
+        start += exposures  # a gain for each view
     else:
         start += [
-            Openings(config.openings),                              # where the hull is open
+            Openings(config.openings),  # where the hull is open
             *exposures,
-            Cavities(config.cavities),                              # what the hull bridges
-            Refinement("refinement", config.refinement, first=True),    # moves whole parts ...
-            Refinement("folds", config.folds, first=False),         # ... then details
-            Revoxelise(),                                           # fields of what has moved
+            Cavities(config.cavities),  # what the hull bridges
+            Refinement("refinement", config.refinement, first=True),  # moves whole parts ...
+            Refinement("folds", config.folds, first=False),  # ... then details
+            Revoxelise(),  # fields of what has moved
         ]
     if config.volume.iterations and not given:
-        start.append(Volume(config.volume))                         # another start, if it is better
+        start.append(Volume(config.volume))  # another start, if it is better
     # Networks are not tied to a lattice: theirs is the last one from the start.
     explicit = parametrisation_named(config.model.field).is_explicit
     revises = config.openings.revise and not (given or config.watertight)
     if config.iterations and config.detail.iterations and explicit:
         start += [
-            Joint("joint", config.joint, config.iterations, lattices.late),     # shape, material and light
-            *([Poses(config.cameras)] if config.poses == "refine" else []),     # corrects the cameras
-            *([Revision(config.openings)] if revises else []),      # what is open after all
-            Joint("detail", config.detail, config.detail.iterations),   # the same on the last lattice
+            Joint("joint", config.joint, config.iterations, lattices.late),  # shape, material and light
+            *([Poses(config.cameras)] if config.poses == "refine" else []),  # corrects the cameras
+            *([Revision(config.openings)] if revises else []),  # what is open after all
+            Joint("detail", config.detail, config.detail.iterations),  # the same on the last lattice
         ]
     else:
         start.append(Joint("joint", config.joint, config.iterations, lattices.last))
     if config.iterations and config.texture.rounds:
-        start.append(Texture(config.texture))                       # colours as fine as the images
+        start.append(Texture(config.texture))  # colours as fine as the images
     return start

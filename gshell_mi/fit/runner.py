@@ -41,8 +41,15 @@ class Runner:
         observer: is told of every step.
     """
 
-    def __init__(self, output: Path, checkpoint: Checkpoint, checkpoint_seconds: float, progress: Progress,
-                 interrupt: Interrupt, observer: Observer | None):
+    def __init__(
+        self,
+        output: Path,
+        checkpoint: Checkpoint,
+        checkpoint_seconds: float,
+        progress: Progress,
+        interrupt: Interrupt,
+        observer: Observer | None,
+    ):
         self.checkpoint, self.checkpoint_seconds = checkpoint, checkpoint_seconds
         self.progress, self.interrupt, self.observer = progress, interrupt, observer
         self.output, self._path, self._log = output, checkpoint_path(output), output / "log.jsonl"
@@ -65,8 +72,10 @@ class Runner:
         elif not checkpoint.stage:
             checkpoint.stage = names[0]
         if checkpoint.stage not in names:
-            raise UserError(f"The checkpoint '{self._path}' is in the stage '{checkpoint.stage}', which this "
-                            f"fit has not; start without --resume.")
+            raise UserError(
+                f"The checkpoint '{self._path}' is in the stage '{checkpoint.stage}', which this "
+                f"fit has not; start without --resume."
+            )
         self._rewind_log(names)
         seen, told = fit, Surface(surface.fields)
         for stage, following in zip(stages, names[1:], strict=True):
@@ -102,8 +111,17 @@ class Runner:
         values = {name: float(value) for name, value in work.step(iteration).items()}
         rounded = {name: float(f"{value:.6g}") for name, value in values.items()}
         with open(self._log, "a") as log:
-            log.write(json.dumps({"stage": stage, "iteration": logged, **rounded,
-                                  "seconds": round(time.monotonic() - begin, 4)}) + "\n")
+            log.write(
+                json.dumps(
+                    {
+                        "stage": stage,
+                        "iteration": logged,
+                        **rounded,
+                        "seconds": round(time.monotonic() - begin, 4),
+                    }
+                )
+                + "\n"
+            )
         if self.observer:
             self.observer.step(stage, logged, count, values, work.preview)
         return values
@@ -138,9 +156,15 @@ class Steps:
         self.done = runner.checkpoint.iteration
         self.kept = runner.checkpoint.part(_WORK)
 
-    def run(self, work: Work, count: int, optimizers: Mapping[str, mi.ad.Adam],
-            state: Callable[[], dict[str, np.ndarray]] = dict,
-            stalled: Callable[[int], bool] = lambda done: False, surface: Surface | None = None) -> None:
+    def run(
+        self,
+        work: Work,
+        count: int,
+        optimizers: Mapping[str, mi.ad.Adam],
+        state: Callable[[], dict[str, np.ndarray]] = dict,
+        stalled: Callable[[int], bool] = lambda done: False,
+        surface: Surface | None = None,
+    ) -> None:
         """Does the steps that are left, once per stage. Each is logged, and now and then all is saved.
 
         Args:

@@ -29,14 +29,20 @@ def check_given(scene: FitScene, config: FitConfig) -> None:
     """
     others = [emitter.id() for emitter in scene.scene.emitters() if emitter.id() != "light"]
     if others:
-        raise UserError(f"Scene '{scene.path}' has another emitter beside 'light' ('{others[0]}'); a fit "
-                        f"explains the images by one environment: take it out, and its light is found as "
-                        f"part of that.")
+        raise UserError(
+            f"Scene '{scene.path}' has another emitter beside 'light' ('{others[0]}'); a fit "
+            f"explains the images by one environment: take it out, and its light is found as "
+            f"part of that."
+        )
     if scene.subject.surface.is_empty:
-        raise UserError(f"The fields '{scene.subject.filename}' of the gshell shape hold no surface; leave "
-                        f"'filename' out of '{scene.path}' or give others.")
+        raise UserError(
+            f"The fields '{scene.subject.filename}' of the gshell shape hold no surface; leave "
+            f"'filename' out of '{scene.path}' or give others."
+        )
     if config.material_is_given and not given_material(scene.bsdf):
         mode = "--geometry-only" if config.geometry_only else "--fixed-material"
-        raise UserError(f"{mode} keeps the material of the gshell shape, but '{scene.path}' gives it no "
-                        f"uniform one; nest a <bsdf type=\"principled\"> with base_color, roughness and "
-                        f"metallic.")
+        raise UserError(
+            f"{mode} keeps the material of the gshell shape, but '{scene.path}' gives it no "
+            f'uniform one; nest a <bsdf type="principled"> with base_color, roughness and '
+            f"metallic."
+        )

@@ -98,8 +98,10 @@ class Fit:
         if surface.gains is not None:
             targets = [target.divided(gain) for target, gain in zip(targets, surface.gains, strict=True)]
         if surface.ignored is not None:
-            targets = [target.ignoring(pixels) for target, pixels in zip(
-                targets, unpacked(surface.ignored, self.views.sizes), strict=True)]
+            targets = [
+                target.ignoring(pixels)
+                for target, pixels in zip(targets, unpacked(surface.ignored, self.views.sizes), strict=True)
+            ]
         if surface.poses is not None:
             sensors = Corrections.from_array(surface.poses).sensors(sensors)
         return replace(self, scene=replace(self.scene, sensors=sensors, targets=targets))

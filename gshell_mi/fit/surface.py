@@ -113,8 +113,9 @@ class Surface:
 
     def after(self, before: Surface) -> Surface:
         """The same, with what was found of the views before unless that has changed."""
-        return replace(self, **{name: getattr(before, name) for name in _OF_VIEWS
-                                if getattr(self, name) is None})
+        return replace(
+            self, **{name: getattr(before, name) for name in _OF_VIEWS if getattr(self, name) is None}
+        )
 
     def with_fields(self, **fields: np.ndarray) -> Surface:
         """The surface with some of its lattice fields replaced."""
@@ -122,34 +123,50 @@ class Surface:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The surface as flat arrays, for ``from_arrays``."""
-        arrays = {"grid": np.array(GRIDS.index(self.fields.grid)), "settled": np.array(self.settled),
-                  "block_resolution": np.array(self.fields.block_resolution)}
+        arrays = {
+            "grid": np.array(GRIDS.index(self.fields.grid)),
+            "settled": np.array(self.settled),
+            "block_resolution": np.array(self.fields.block_resolution),
+        }
         optional = {name: getattr(self.fields, name) for name in (*_FIELDS, *_OPTIONAL)}
         optional |= {"hull": self.hull} | {name: getattr(self, name) for name in _OF_VIEWS}
         arrays |= {name: array for name, array in optional.items() if array is not None}
         if self.seen:
             arrays |= {name: getattr(self.seen, name) for name in ("radiance", "known", "light")}
         for index, moved in enumerate(self.moved):
-            arrays |= {f"moved {index} {moved.stage} {name}": np.asarray(getattr(moved, name))
-                       for name in ("positions", "radiance")}
-            arrays |= {f"moved {index} {moved.stage} fitted {name}": array
-                       for name, array in moved.fitted.items()}
+            arrays |= {
+                f"moved {index} {moved.stage} {name}": np.asarray(getattr(moved, name))
+                for name in ("positions", "radiance")
+            }
+            arrays |= {
+                f"moved {index} {moved.stage} fitted {name}": array for name, array in moved.fitted.items()
+            }
         arrays |= {f"model {name}": array for name, array in self.model.items()}
         return arrays
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Surface:
         """What ``to_arrays`` gave."""
-        fields = LatticeFields(**{name: arrays[name] for name in _FIELDS}, grid=GRIDS[int(arrays["grid"])],
-                               **{name: arrays[name] for name in _OPTIONAL if name in arrays},
-                               block_resolution=int(arrays["block_resolution"]))
+        fields = LatticeFields(
+            **{name: arrays[name] for name in _FIELDS},
+            grid=GRIDS[int(arrays["grid"])],
+            **{name: arrays[name] for name in _OPTIONAL if name in arrays},
+            block_resolution=int(arrays["block_resolution"]),
+        )
         seen = None
         if "radiance" in arrays:
             seen = Seen(arrays["radiance"], arrays["known"], np.float32(arrays["light"]))
         stages = sorted({tuple(name.split(" ")[1:3]) for name in arrays if name.startswith("moved ")})
         moved = [_moved(stage, _under(arrays, f"moved {index} {stage} ")) for index, stage in stages]
-        return cls(fields, arrays.get("hull"), seen, tuple(moved), _under(arrays, "model "),
-                   bool(arrays["settled"]), **{name: arrays.get(name) for name in _OF_VIEWS})
+        return cls(
+            fields,
+            arrays.get("hull"),
+            seen,
+            tuple(moved),
+            _under(arrays, "model "),
+            bool(arrays["settled"]),
+            **{name: arrays.get(name) for name in _OF_VIEWS},
+        )
 
 
 def _moved(stage: str, arrays: Mapping[str, np.ndarray]) -> Moved:

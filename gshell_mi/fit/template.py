@@ -56,8 +56,9 @@ class Template:
         return self.logits > 0
 
 
-def closed_template(subject: mi.Shape, sdf: np.ndarray,
-                    lattice: Lattice | BlockLattice) -> tuple[SurfaceMesh, np.ndarray, np.ndarray]:
+def closed_template(
+    subject: mi.Shape, sdf: np.ndarray, lattice: Lattice | BlockLattice
+) -> tuple[SurfaceMesh, np.ndarray, np.ndarray]:
     """The template that is where ``sdf`` changes sign, its vertices (V, 3) and its faces (F, 3).
 
     Args:
@@ -70,8 +71,7 @@ def closed_template(subject: mi.Shape, sdf: np.ndarray,
     return mesh, vertices, faces
 
 
-def template_of(subject: mi.Shape, surface: Surface, *,
-                like: Template | None = None) -> Template:
+def template_of(subject: mi.Shape, surface: Surface, *, like: Template | None = None) -> Template:
     """Extracts a template from lattice fields.
 
     Args:

@@ -76,11 +76,25 @@ def _generate(given: _Arguments) -> None:
     from ..generation.sampled import generate
 
     output = given.output or (given.model or Path()) / "generated"
-    print(generate(
-        given.model or SHIPPED, output, count=given.count, kind=given.kind,
-        seed=given.seed, guidance=given.guidance, steps=given.steps, interpolate=given.interpolate,
-        near=given.near, strength=given.strength, complete=given.complete, suffix=given.format,
-        batch=given.batch, device=given.device, quiet=given.quiet))
+    print(
+        generate(
+            given.model or SHIPPED,
+            output,
+            count=given.count,
+            kind=given.kind,
+            seed=given.seed,
+            guidance=given.guidance,
+            steps=given.steps,
+            interpolate=given.interpolate,
+            near=given.near,
+            strength=given.strength,
+            complete=given.complete,
+            suffix=given.format,
+            batch=given.batch,
+            device=given.device,
+            quiet=given.quiet,
+        )
+    )
 
 
 if __name__ == "__main__":

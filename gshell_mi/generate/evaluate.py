@@ -44,8 +44,9 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return run_command("generate.evaluate", "Score samples against a data set.", _Arguments, _evaluate,
-                       arguments)
+    return run_command(
+        "generate.evaluate", "Score samples against a data set.", _Arguments, _evaluate, arguments
+    )
 
 
 def _evaluate(given: _Arguments) -> None:
@@ -61,8 +62,9 @@ def _evaluate(given: _Arguments) -> None:
     if given.json:
         check_scores_file(given.json)
     data = DataSet.open(given.data_set)
-    scores = evaluate(read_samples(given.samples, given.points), data, points=given.points, emd=given.emd,
-                      quiet=given.quiet)
+    scores = evaluate(
+        read_samples(given.samples, given.points), data, points=given.points, emd=given.emd, quiet=given.quiet
+    )
     if given.json:
         write_scores(given.json, scores)
     table = Table("score", "", "")

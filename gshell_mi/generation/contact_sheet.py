@@ -16,8 +16,9 @@ _LIGHT = np.array([0.35, 0.65, 0.67])
 _SUPER = 2  # points are drawn on a picture so much larger
 
 
-def picture(mesh: trimesh.Trimesh, side: int = 128, *, azimuth: float = 0.5, elevation: float = 0.25,
-            seed: int = 0) -> np.ndarray:
+def picture(
+    mesh: trimesh.Trimesh, side: int = 128, *, azimuth: float = 0.5, elevation: float = 0.25, seed: int = 0
+) -> np.ndarray:
     """(side, side, 3) uint8: the mesh, from [-1, 1]^3, as seen from afar, back faces in orange.
 
     Args:
@@ -29,8 +30,9 @@ def picture(mesh: trimesh.Trimesh, side: int = 128, *, azimuth: float = 0.5, ele
     scale = size / 2 / 1.3
     count = int(np.clip(6 * area * scale**2, 2_000, 400_000))
     points, face = surface_points(mesh, count, seed)
-    toward = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation),
-                       np.cos(azimuth) * np.cos(elevation)])
+    toward = np.array(
+        [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
+    )
     right = np.array([np.cos(azimuth), 0, -np.sin(azimuth)])
     up = np.cross(toward, right)
     column = (size / 2 + scale * points @ right).astype(int)
@@ -40,7 +42,7 @@ def picture(mesh: trimesh.Trimesh, side: int = 128, *, azimuth: float = 0.5, ele
     order = np.argsort(depth)  # the nearest is drawn last
     normals = mesh.face_normals[face]
     front = normals @ toward > 0
-    light = (right * _LIGHT[0] + up * _LIGHT[1] + toward * _LIGHT[2])
+    light = right * _LIGHT[0] + up * _LIGHT[1] + toward * _LIGHT[2]
     shade = 0.25 + 0.75 * np.clip(np.where(front, 1, -1) * (normals @ light), 0, 1)
     image = np.ones((size, size, 3))
     image[row[order], column[order]] = (np.where(front[:, None], _FRONT, _BACK) * shade[:, None])[order]

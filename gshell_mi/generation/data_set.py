@@ -70,15 +70,21 @@ class DataSet:
             raise UserError(f"'{path}' is no data set; make one with python -m gshell_mi.dataset.")
         try:
             config = read_json_object(path / _CONFIG)
-            config = {"side": int(config["side"]), "classes": [str(name) for name in config["classes"]],
-                      "shards": int(config["shards"]), "digest": str(config["digest"])}
+            config = {
+                "side": int(config["side"]),
+                "classes": [str(name) for name in config["classes"]],
+                "shards": int(config["shards"]),
+                "digest": str(config["digest"]),
+            }
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"'{path / _CONFIG}' is damaged ({error}); make the data set again.") from error
         found = cls(path, config)
         missing = [i for i in range(config["shards"]) if not found.shard_path(i).is_file()]
         if missing:
-            raise UserError(f"'{path}' is not finished: {len(missing)} of {config['shards']} shards are "
-                            f"missing; run the same gshell_mi.dataset command again to go on.")
+            raise UserError(
+                f"'{path}' is not finished: {len(missing)} of {config['shards']} shards are "
+                f"missing; run the same gshell_mi.dataset command again to go on."
+            )
         return found
 
     @staticmethod
@@ -107,8 +113,11 @@ class DataSet:
     @cached_property
     def records(self) -> list[Record]:
         """Of all objects, in order."""
-        return [record for number in range(self.config["shards"])
-                for record in read_records(self.shard_path(number))]
+        return [
+            record
+            for number in range(self.config["shards"])
+            for record in read_records(self.shard_path(number))
+        ]
 
     def load(self, *, held_out: bool) -> tuple[list[Record], np.ndarray, np.ndarray, np.ndarray]:
         """Records, signed distances and mSDFs (n, N, N, N) float16 and points (n, 2048, 3) of one split.
@@ -123,8 +132,9 @@ class DataSet:
             parts.append((shard.sdf[chosen], shard.msdf[chosen], shard.points[chosen]))
         if not records:
             split = "held-out" if held_out else "training"
-            raise UserError(f"'{self.path}' has no {split} objects; make a larger set, or another "
-                            f"--held-out.")
+            raise UserError(
+                f"'{self.path}' has no {split} objects; make a larger set, or another --held-out."
+            )
         sdf, msdf, points = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         return records, sdf, msdf, points
 
@@ -145,9 +155,17 @@ def read_config(path: Path) -> dict | None:
 
 def write_shard(path: Path, rows: list[Row], rejected: list[dict], side: int, held_out: float) -> None:
     """Writes the objects of one shard, in one step."""
-    records = [{"name": row.source.name, "kind": row.source.kind, "loops": row.loops,
-                "held_out": row.source.is_held_out(held_out), "chamfer": round(row.chamfer, 5),
-                "loops_kept": row.loops_kept} for row in rows]
+    records = [
+        {
+            "name": row.source.name,
+            "kind": row.source.kind,
+            "loops": row.loops,
+            "held_out": row.source.is_held_out(held_out),
+            "chamfer": round(row.chamfer, 5),
+            "loops_kept": row.loops_kept,
+        }
+        for row in rows
+    ]
     shape = (len(rows), side, side, side)
     with replacing(path) as partial:
         np.savez_compressed(
@@ -155,7 +173,9 @@ def write_shard(path: Path, rows: list[Row], rejected: list[dict], side: int, he
             sdf=np.array([row.fields.sdf for row in rows], np.float16).reshape(shape),
             msdf=np.array([row.fields.msdf for row in rows], np.float16).reshape(shape),
             points=np.array([row.points for row in rows], np.float16).reshape(len(rows), POINTS, 3),
-            records=np.array(json.dumps(records)), rejected=np.array(json.dumps(rejected)))
+            records=np.array(json.dumps(records)),
+            rejected=np.array(json.dumps(rejected)),
+        )
 
 
 def read_records(path: Path) -> list[Record]:
@@ -172,8 +192,10 @@ def _records(archive) -> list[Record]:
 
 
 def _damaged(path: Path, error: Exception) -> UserError:
-    return UserError(f"Shard '{path}' cannot be read ({type(error).__name__}); remove it and run the same "
-                     f"gshell_mi.dataset command again, which makes it anew.")
+    return UserError(
+        f"Shard '{path}' cannot be read ({type(error).__name__}); remove it and run the same "
+        f"gshell_mi.dataset command again, which makes it anew."
+    )
 
 
 def read_shard(path: Path, side: int) -> Shard:
@@ -181,16 +203,25 @@ def read_shard(path: Path, side: int) -> Shard:
     try:
         with np.load(path) as archive:
             records = _records(archive)
-            shard = Shard(records, json.loads(str(archive["rejected"])), archive["sdf"], archive["msdf"],
-                          archive["points"])
+            shard = Shard(
+                records,
+                json.loads(str(archive["rejected"])),
+                archive["sdf"],
+                archive["msdf"],
+                archive["points"],
+            )
     except Exception as error:  # NumPy's readers raise whatever they stumble over
         raise _damaged(path, error) from error
     shape = (len(records), side, side, side)
     found = (shard.sdf.shape, shard.msdf.shape, shard.points.shape)
     if found != (shape, shape, (len(records), POINTS, 3)):
-        raise UserError(f"Shard '{path}' does not fit its set; remove it and run the same gshell_mi.dataset "
-                        f"command again, which makes it anew.")
+        raise UserError(
+            f"Shard '{path}' does not fit its set; remove it and run the same gshell_mi.dataset "
+            f"command again, which makes it anew."
+        )
     if not (np.isfinite(shard.sdf).all() and np.isfinite(shard.msdf).all()):
-        raise UserError(f"Shard '{path}' holds NaN or infinity; remove it and run the same gshell_mi.dataset "
-                        f"command again, which makes it anew.")
+        raise UserError(
+            f"Shard '{path}' holds NaN or infinity; remove it and run the same gshell_mi.dataset "
+            f"command again, which makes it anew."
+        )
     return shard

@@ -93,14 +93,16 @@ class CubicEncoding:
             a, b = ends.reshape(2, -1)
             # |s_a| / |s_b| = t / (1 - t) is linear in logarithms, and counts most where it is moderate.
             row = np.arange(len(a))
-            ratio = _solved(row, a, b, np.ones(len(a)), -np.ones(len(a)), np.log(t / (1 - t)), t * (1 - t),
-                            len(used))
+            ratio = _solved(
+                row, a, b, np.ones(len(a)), -np.ones(len(a)), np.log(t / (1 - t)), t * (1 - t), len(used)
+            )
             sdf[used] *= np.clip(np.exp(np.clip(ratio - ratio.mean(), -8, 8)), 1e-3, 1e3)
             sdf /= max(1.0, np.abs(sdf).max())
             at_vertices[used] = _solved(row, a, b, 1 - t, t, msdf, np.ones(len(a)), len(used))
         shape = (n, n, n)
-        return TruncatedFields(sdf.reshape(shape).astype(np.float32),
-                               at_vertices.reshape(shape).astype(np.float32))
+        return TruncatedFields(
+            sdf.reshape(shape).astype(np.float32), at_vertices.reshape(shape).astype(np.float32)
+        )
 
 
 class BlockEncoding:
@@ -145,14 +147,18 @@ def from_blocks(blocks: np.ndarray, values: np.ndarray, side: int) -> TruncatedF
     return TruncatedFields(sdf, np.where(missing, np.float32(-1), msdf))
 
 
-ENCODINGS: dict[str, Encoding] = {"dense": DenseEncoding(), "cubic": CubicEncoding(),
-                                  "blocks": BlockEncoding()}
+ENCODINGS: dict[str, Encoding] = {
+    "dense": DenseEncoding(),
+    "cubic": CubicEncoding(),
+    "blocks": BlockEncoding(),
+}
 
 
 def _blocks_per_side(side: int) -> int:
     if side % BLOCK:
-        raise UserError(f"blocks of {BLOCK} vertices per side do not fill a grid of {side}; give a multiple "
-                        f"of {BLOCK}")
+        raise UserError(
+            f"blocks of {BLOCK} vertices per side do not fill a grid of {side}; give a multiple of {BLOCK}"
+        )
     return side // BLOCK
 
 
@@ -181,8 +187,10 @@ def _node(vertex: np.ndarray, n: int, offset: tuple[int, int, int]) -> tuple[np.
 
 def _solved(row, a, b, weight_a, weight_b, right, importance, count: int) -> np.ndarray:
     """Least squares for values with ``weight_a x_a + weight_b x_b = right`` on every edge."""
-    matrix = coo_array((np.concatenate([weight_a, weight_b]), (np.concatenate([row, row]),
-                        np.concatenate([a, b]))), shape=(len(row), count)).tocsr()
+    matrix = coo_array(
+        (np.concatenate([weight_a, weight_b]), (np.concatenate([row, row]), np.concatenate([a, b]))),
+        shape=(len(row), count),
+    ).tocsr()
     normal = (matrix.T @ diags_array(importance) @ matrix + _DAMPING * diags_array(np.ones(count))).tocsr()
     jacobi = diags_array(1 / normal.diagonal())
     return cg(normal, matrix.T @ (importance * right), rtol=1e-6, maxiter=2000, M=jacobi)[0]

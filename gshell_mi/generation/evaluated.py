@@ -51,22 +51,36 @@ def read_samples(folder: Path, points: int) -> Samples:
         raise UserError(f"'{folder}' holds no samples; make some with python -m gshell_mi.generate.")
     try:
         told = read_json_object(folder / "samples.json")
-        rows = [(str(row["file"]), str(row["class"]), int(row["loops"]), int(row["components"]),
-                 int(row["faces"])) for row in told["samples"]]
+        rows = [
+            (
+                str(row["file"]),
+                str(row["class"]),
+                int(row["loops"]),
+                int(row["components"]),
+                int(row["faces"]),
+            )
+            for row in told["samples"]
+        ]
         seconds = float(told["seconds_per_sample"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"'{folder / 'samples.json'}' is damaged ({error}); sample again.") from error
     full = [row for row in rows if row[4] > 0]
     if not full:
         raise UserError(f"All samples in '{folder}' are empty; train the model for longer.")
-    found = [surface_points(read_mesh(folder / row[0]), points, i)[0]
-             for i, row in enumerate(full)]
-    return Samples(np.array(found), [row[1] for row in full], [row[2] for row in full],
-                   [row[3] for row in full], len(rows) - len(full), seconds)
+    found = [surface_points(read_mesh(folder / row[0]), points, i)[0] for i, row in enumerate(full)]
+    return Samples(
+        np.array(found),
+        [row[1] for row in full],
+        [row[2] for row in full],
+        [row[3] for row in full],
+        len(rows) - len(full),
+        seconds,
+    )
 
 
-def evaluate(samples: Samples, data: DataSet, *, points: int = 512, emd: int = 32,
-             quiet: bool = True) -> dict:
+def evaluate(
+    samples: Samples, data: DataSet, *, points: int = 512, emd: int = 32, quiet: bool = True
+) -> dict:
     """Scores of samples against the held-out objects of a data set.
 
     Distances are of the cube [-1, 1]^3, in which both lie. Both sets are cut to the size of the smaller. The
@@ -82,8 +96,12 @@ def evaluate(samples: Samples, data: DataSet, *, points: int = 512, emd: int = 3
     a = samples.points[mine, :points].astype(np.float32)
     b = true_points[theirs, :points].astype(np.float32)
     trained = train_points[:, :points].astype(np.float32)
-    columns = (TextColumn("comparing"), BarColumn(), TextColumn("{task.percentage:.0f} %"),
-               TimeRemainingColumn())
+    columns = (
+        TextColumn("comparing"),
+        BarColumn(),
+        TextColumn("{task.percentage:.0f} %"),
+        TimeRemainingColumn(),
+    )
     with Bars(*columns, quiet=quiet) as progress:
         bar = progress.add_task("", total=3 * len(a) + 2 * len(b))
 
@@ -107,11 +125,18 @@ def evaluate(samples: Samples, data: DataSet, *, points: int = 512, emd: int = 3
     if emd:
         a, b = a[:emd, :128], b[:emd, :128]
         moved = earth_movers_distances(a, b)
-        scores |= {"mmd_emd": minimum_matching_distance(moved), "coverage_emd": coverage(moved),
-                   "nearest_neighbour_accuracy_emd": nearest_neighbour_accuracy(
-                       earth_movers_distances(a, a), moved, earth_movers_distances(b, b))}
-    return scores | _topology(samples, train_records) | {"seconds_per_sample": samples.seconds,
-                                                         "empty": samples.empty}
+        scores |= {
+            "mmd_emd": minimum_matching_distance(moved),
+            "coverage_emd": coverage(moved),
+            "nearest_neighbour_accuracy_emd": nearest_neighbour_accuracy(
+                earth_movers_distances(a, a), moved, earth_movers_distances(b, b)
+            ),
+        }
+    return (
+        scores
+        | _topology(samples, train_records)
+        | {"seconds_per_sample": samples.seconds, "empty": samples.empty}
+    )
 
 
 def _topology(samples: Samples, records: list[Record]) -> dict:
@@ -121,8 +146,10 @@ def _topology(samples: Samples, records: list[Record]) -> dict:
         expected[record.kind].add(record.loops)
         expected["any"].add(record.loops)
     right = [loops in expected[kind] for kind, loops in zip(samples.kinds, samples.loops, strict=True)]
-    return {"loops_as_class": float(np.mean(right)),
-            "one_component": float(np.mean(np.array(samples.components) == 1))}
+    return {
+        "loops_as_class": float(np.mean(right)),
+        "one_component": float(np.mean(np.array(samples.components) == 1)),
+    }
 
 
 def _paired(kinds: list[str], others: list[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -140,4 +167,3 @@ def _paired(kinds: list[str], others: list[str]) -> tuple[np.ndarray, np.ndarray
     # Turn by turn, so that a part of the set has all classes.
     order = np.argsort(np.concatenate([np.arange(len(part)) for part in mine]), kind="stable")
     return np.concatenate(mine)[order], np.concatenate(theirs)[order]
-

@@ -28,8 +28,15 @@ _SPECK = 12
 #: What a speck becomes, by the truncation.
 _FLIPPED = 0.05
 #: Neighbours along the edges of the tetrahedral lattice.
-_LATTICE_NEIGHBOURS = np.array([[[(z >= 0 and y >= 0 and x >= 0) or (z <= 0 and y <= 0 and x <= 0)
-                                  for x in (-1, 0, 1)] for y in (-1, 0, 1)] for z in (-1, 0, 1)])
+_LATTICE_NEIGHBOURS = np.array(
+    [
+        [
+            [(z >= 0 and y >= 0 and x >= 0) or (z <= 0 and y <= 0 and x <= 0) for x in (-1, 0, 1)]
+            for y in (-1, 0, 1)
+        ]
+        for z in (-1, 0, 1)
+    ]
+)
 #: Cells between a mesh and the cube's faces, so that its template closes within.
 MARGIN_CELLS = 3.5
 

@@ -32,9 +32,19 @@ from .sources import Source, garment_sources, mesh_sources
 _SHOWN = 48
 
 
-def make_data_set(output: Path, places: list[Path], *, garments: int = 0, seed: int = 0, side: int = 64,
-                  held_out: float = 0.1, most: float = 0.5, processes: int = 1,
-                  variant: str = "llvm_ad_rgb", quiet: bool = True) -> str:
+def make_data_set(
+    output: Path,
+    places: list[Path],
+    *,
+    garments: int = 0,
+    seed: int = 0,
+    side: int = 64,
+    held_out: float = 0.1,
+    most: float = 0.5,
+    processes: int = 1,
+    variant: str = "llvm_ad_rgb",
+    quiet: bool = True,
+) -> str:
     """Makes a data set, or goes on with one that is not finished; returns what to tell about it.
 
     Args:
@@ -49,28 +59,43 @@ def make_data_set(output: Path, places: list[Path], *, garments: int = 0, seed: 
     """
     sources = mesh_sources(places) + garment_sources(garments, seed)
     described = json.dumps([source.to_dict() for source in sources] + [side, held_out, most])
-    config = {"side": side, "classes": sorted({source.kind for source in sources}),
-              "shards": -(-len(sources) // SHARD), "held_out": held_out, "max_chamfer": most,
-              "objects": len(sources), "digest": hashlib.sha256(described.encode()).hexdigest()}
+    config = {
+        "side": side,
+        "classes": sorted({source.kind for source in sources}),
+        "shards": -(-len(sources) // SHARD),
+        "held_out": held_out,
+        "max_chamfer": most,
+        "objects": len(sources),
+        "digest": hashlib.sha256(described.encode()).hexdigest(),
+    }
     output.mkdir(parents=True, exist_ok=True)
     with own_folder(output, "dataset") as folder:
         old = read_config(output) if folder.is_marked() else None
         if old is not None and old.get("digest") != config["digest"]:
-            raise UserError(f"'{output}' holds a data set of other sources or settings; choose another place "
-                            f"with -o.")
+            raise UserError(
+                f"'{output}' holds a data set of other sources or settings; choose another place with -o."
+            )
         names = [DataSet.shard_name(number) for number in range(config["shards"])]
         folder.claim(*names, "sheet.png", "statistics.json")
         write_config(folder, config)
         (output / "shards").mkdir(exist_ok=True)
         waiting = [number for number, name in enumerate(names) if not (output / name).is_file()]
-        jobs = [(output / names[number], sources[number * SHARD:(number + 1) * SHARD], side, held_out, most)
-                for number in waiting]
+        jobs = [
+            (output / names[number], sources[number * SHARD : (number + 1) * SHARD], side, held_out, most)
+            for number in waiting
+        ]
         started, done = time.perf_counter(), 0
-        columns = (TextColumn("converting"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-                   TextColumn("{task.fields[rate]}"))
+        columns = (
+            TextColumn("converting"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[rate]}"),
+        )
         with Bars(*columns, quiet=quiet) as progress:
-            bar = progress.add_task("", total=len(sources), rate="",
-                                    completed=len(sources) - sum(len(job[1]) for job in jobs))
+            bar = progress.add_task(
+                "", total=len(sources), rate="", completed=len(sources) - sum(len(job[1]) for job in jobs)
+            )
 
             def advance(objects: int) -> None:
                 nonlocal done
@@ -83,13 +108,17 @@ def make_data_set(output: Path, places: list[Path], *, garments: int = 0, seed: 
         _write_json(folder, "statistics.json", statistics)
         if statistics["objects"] == 0:
             reason = statistics["rejected"][0]
-            raise UserError(f"None of {counted(len(sources), 'object')} could be used: {reason['name']}: "
-                            f"{reason['reason']}; all reasons are in '{output / 'statistics.json'}'.")
+            raise UserError(
+                f"None of {counted(len(sources), 'object')} could be used: {reason['name']}: "
+                f"{reason['reason']}; all reasons are in '{output / 'statistics.json'}'."
+            )
         _draw(DataSet(output, config), output / "sheet.png")
     rejected = len(statistics["rejected"])
-    return (f"{output}: {counted(statistics['objects'], 'object')}, {statistics['held_out']} of them held "
-            f"out; {rejected} refused (see statistics.json); chamfer {statistics['chamfer_mean']:.3f} %, "
-            f"loops kept of {100 * statistics['loops_kept']:.1f} %")
+    return (
+        f"{output}: {counted(statistics['objects'], 'object')}, {statistics['held_out']} of them held "
+        f"out; {rejected} refused (see statistics.json); chamfer {statistics['chamfer_mean']:.3f} %, "
+        f"loops kept of {100 * statistics['loops_kept']:.1f} %"
+    )
 
 
 def _run(jobs: list[tuple], processes: int, variant: str, advance: Callable[[int], None]) -> None:
@@ -98,8 +127,12 @@ def _run(jobs: list[tuple], processes: int, variant: str, advance: Callable[[int
             _convert_shard(*job, advance=advance)
         return
     # Spawned, as a process that has used Dr.Jit must not be forked.
-    with ProcessPoolExecutor(min(processes, len(jobs)), multiprocessing.get_context("spawn"),
-                             initializer=_begin, initargs=(variant,)) as pool:
+    with ProcessPoolExecutor(
+        min(processes, len(jobs)),
+        multiprocessing.get_context("spawn"),
+        initializer=_begin,
+        initargs=(variant,),
+    ) as pool:
         futures = {pool.submit(_convert_shard, *job): len(job[1]) for job in jobs}
         try:
             for future in as_completed(futures):
@@ -119,8 +152,15 @@ def _begin(variant: str) -> None:
         dr.set_thread_count(1)  # the processes are what runs side by side
 
 
-def _convert_shard(path: Path, sources: list[Source], side: int, held_out: float, most: float, *,
-                   advance: Callable[[int], None] = lambda _: None) -> None:
+def _convert_shard(
+    path: Path,
+    sources: list[Source],
+    side: int,
+    held_out: float,
+    most: float,
+    *,
+    advance: Callable[[int], None] = lambda _: None,
+) -> None:
     rows, rejected = [], []
     for source in sources:
         check_interrupt()

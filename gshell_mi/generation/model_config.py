@@ -72,16 +72,23 @@ class ModelConfig:
         """
         try:
             found = read_json_object(path)["config"]
-            config = cls(str(found["model"]), str(found["size"]), int(found["side"]),
-                         tuple(str(name) for name in found["classes"]))
+            config = cls(
+                str(found["model"]),
+                str(found["size"]),
+                int(found["side"]),
+                tuple(str(name) for name in found["classes"]),
+            )
         except FileNotFoundError:
-            raise UserError(f"'{path.parent}' holds no model; train one with python -m "
-                            f"gshell_mi.train.") from None
+            raise UserError(
+                f"'{path.parent}' holds no model; train one with python -m gshell_mi.train."
+            ) from None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"'{path}' is damaged ({error}); train the model again.") from error
         if config.model not in MODELS or config.size not in SIZES:
-            raise UserError(f"'{path}' describes a model of another kind ('{config.model}', size "
-                            f"'{config.size}'); it belongs to another version of gshell_mi.")
+            raise UserError(
+                f"'{path}' describes a model of another kind ('{config.model}', size "
+                f"'{config.size}'); it belongs to another version of gshell_mi."
+            )
         if config.side % 8 or not 16 <= config.side <= 256:
             raise UserError(f"'{path}' describes a grid that no model here has; train the model again.")
         return config

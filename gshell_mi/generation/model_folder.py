@@ -29,15 +29,23 @@ def check_same(output: Path, made: ModelConfig, config: TrainConfig, data: DataS
     old = ModelConfig.read(output / "model.json")
     told = json.loads((output / "model.json").read_text(encoding="utf-8"))
     if old != made or told.get("data") != data.config["digest"] or told.get("seed") != config.seed:
-        raise UserError(f"'{output}' holds a model of another kind, size, seed or data set; choose another "
-                        f"place with -o.")
+        raise UserError(
+            f"'{output}' holds a model of another kind, size, seed or data set; choose another place with -o."
+        )
 
 
 def write_card(output: Path, made: ModelConfig, config: TrainConfig, data: DataSet) -> None:
     """Writes ``model.json``: what the model is, and what it is trained on."""
-    card = {"config": made.to_dict(), "seed": config.seed, "data": data.config["digest"],
-            "objects": sum(not record.held_out for record in data.records),
-            "minutes": config.minutes, "steps": config.steps, "batch": config.batch, "rate": config.rate}
+    card = {
+        "config": made.to_dict(),
+        "seed": config.seed,
+        "data": data.config["digest"],
+        "objects": sum(not record.held_out for record in data.records),
+        "minutes": config.minutes,
+        "steps": config.steps,
+        "batch": config.batch,
+        "rate": config.rate,
+    }
     with replacing(output / "model.json") as partial:
         partial.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
@@ -54,9 +62,15 @@ def load_model(folder: Path, device: torch.device) -> ShapeFlow | LatentFlow | D
         raise UserError(f"'{folder}' has no weights yet; train it with python -m gshell_mi.train.")
     model = make_model(made)
     try:
-        model.load_state_dict({name: value.float() if value.is_floating_point() else value
-                               for name, value in load_file(path).items()})
+        model.load_state_dict(
+            {
+                name: value.float() if value.is_floating_point() else value
+                for name, value in load_file(path).items()
+            }
+        )
     except Exception as error:
-        raise UserError(f"'{path}' does not hold the weights of the model that model.json describes "
-                        f"({type(error).__name__}); train it again.") from error
+        raise UserError(
+            f"'{path}' does not hold the weights of the model that model.json describes "
+            f"({type(error).__name__}); train it again."
+        ) from error
     return model.to(device).eval()

@@ -28,8 +28,10 @@ def in_own_process(work: Callable, *arguments: Any, variant: str | None = None) 
         try:
             return pool.submit(work, *arguments).result()
         except BrokenProcessPool as error:
-            raise UserError("The process that computes was ended from outside, perhaps for want of memory; "
-                            "free some, or ask for less at once.") from error
+            raise UserError(
+                "The process that computes was ended from outside, perhaps for want of memory; "
+                "free some, or ask for less at once."
+            ) from error
 
 
 def _begin(variant: str | None) -> None:
@@ -44,5 +46,6 @@ def require_torch() -> None:
 
     missing = [name for name in ("torch", "monai", "einops", "safetensors") if find_spec(name) is None]
     if missing:
-        raise UserError(f"This needs {' and '.join(missing)}; install them with pip install "
-                        f"'gshell_mi[generate]'.")
+        raise UserError(
+            f"This needs {' and '.join(missing)}; install them with pip install 'gshell_mi[generate]'."
+        )

@@ -26,10 +26,24 @@ _FPS = 12
 _HELD_CELLS = 2.0
 
 
-def generate(model: Path, output: Path, *, count: int = 16, kind: str | None = None, seed: int = 0,
-             guidance: float = 1.0, steps: int = 32, interpolate: tuple[int, int] | None = None,
-             near: Path | None = None, strength: float = 0.5, complete: Path | None = None,
-             suffix: str = "ply", batch: int = 16, device: str = "auto", quiet: bool = True) -> str:
+def generate(
+    model: Path,
+    output: Path,
+    *,
+    count: int = 16,
+    kind: str | None = None,
+    seed: int = 0,
+    guidance: float = 1.0,
+    steps: int = 32,
+    interpolate: tuple[int, int] | None = None,
+    near: Path | None = None,
+    strength: float = 0.5,
+    complete: Path | None = None,
+    suffix: str = "ply",
+    batch: int = 16,
+    device: str = "auto",
+    quiet: bool = True,
+) -> str:
     """Samples meshes into a folder; returns what to tell about them. Needs a Mitsuba variant.
 
     The meshes lie in [-1, 1]^3; with ``near`` or ``complete`` they have the place and size of what was given.
@@ -52,24 +66,45 @@ def generate(model: Path, output: Path, *, count: int = 16, kind: str | None = N
     start, known, back = None, None, np.eye(4)
     if near is not None or complete is not None:
         start, known, back = _given(near, complete, config.side)
-    numbers = [classes.index(kind) if kind else (None if start is not None else i % len(classes))
-               for i in range(count)]
+    numbers = [
+        classes.index(kind) if kind else (None if start is not None else i % len(classes))
+        for i in range(count)
+    ]
     if interpolate is None:
         seeds = [(seed + i, seed + i, 0.0) for i in range(count)]
     else:
         numbers = [classes.index(kind) if kind else None] * count
         seeds = [(*interpolate, float(part)) for part in np.linspace(0, 1, count)]
-    request = Request(numbers, seeds, guidance, steps, batch, device, start,
-                      1.0 if complete is not None else strength, known, quiet)
+    request = Request(
+        numbers,
+        seeds,
+        guidance,
+        steps,
+        batch,
+        device,
+        start,
+        1.0 if complete is not None else strength,
+        known,
+        quiet,
+    )
     fields, seconds = sampled_fields(model, request)
     output.mkdir(parents=True, exist_ok=True)
     with own_folder(output, "generate") as folder:
-        return _write(folder, fields, [classes[n] if n is not None else "any" for n in numbers], seeds, back,
-                      seconds, suffix, film=interpolate is not None)
+        return _write(
+            folder,
+            fields,
+            [classes[n] if n is not None else "any" for n in numbers],
+            seeds,
+            back,
+            seconds,
+            suffix,
+            film=interpolate is not None,
+        )
 
 
-def _given(near: Path | None, complete: Path | None, side: int) -> tuple[np.ndarray, np.ndarray | None,
-                                                                         np.ndarray]:
+def _given(
+    near: Path | None, complete: Path | None, side: int
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     """Fields to start from, where they are known, and the matrix back to the world."""
     place = near if complete is None else complete
     if place is None:
@@ -98,8 +133,17 @@ def near_points(points: np.ndarray, side: int, cells: float) -> np.ndarray:
     return (seen & (distance < cells * 2 / (side - 1))).reshape(side, side, side)
 
 
-def _write(folder: OwnFolder, fields: np.ndarray, kinds: list[str], seeds: list, back: np.ndarray,
-           seconds: float, suffix: str, *, film: bool) -> str:
+def _write(
+    folder: OwnFolder,
+    fields: np.ndarray,
+    kinds: list[str],
+    seeds: list,
+    back: np.ndarray,
+    seconds: float,
+    suffix: str,
+    *,
+    film: bool,
+) -> str:
     from ..export.gltf import Part, write_glb
     from ..export.ply import write_ply
 
@@ -113,8 +157,16 @@ def _write(folder: OwnFolder, fields: np.ndarray, kinds: list[str], seeds: list,
     for index, (pair, kind, name) in enumerate(zip(fields, kinds, names, strict=True)):
         mesh = TruncatedFields(*pair).surface(largest=True)
         found = topology(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-        told.append({"file": name, "class": kind, "seeds": seeds[index], "loops": found.boundary_loops,
-                     "components": found.components, "faces": found.faces})
+        told.append(
+            {
+                "file": name,
+                "class": kind,
+                "seeds": seeds[index],
+                "loops": found.boundary_loops,
+                "components": found.components,
+                "faces": found.faces,
+            }
+        )
         labels.append(f"{kind}, {counted(found.boundary_loops, 'loop')}")
         if len(mesh.faces) == 0:
             pictures.append(np.full((128, 128, 3), 255, np.uint8))
@@ -125,20 +177,36 @@ def _write(folder: OwnFolder, fields: np.ndarray, kinds: list[str], seeds: list,
         if suffix == "ply":
             write_ply(folder.path / name, placed.vertices, placed.faces, normals, {})
         else:
-            write_glb(folder.path / name, [Part("sample", placed.faces, {
-                "POSITION": np.asarray(placed.vertices, np.float32), "NORMAL": normals.astype(np.float32)},
-                {"doubleSided": True})])
+            write_glb(
+                folder.path / name,
+                [
+                    Part(
+                        "sample",
+                        placed.faces,
+                        {
+                            "POSITION": np.asarray(placed.vertices, np.float32),
+                            "NORMAL": normals.astype(np.float32),
+                        },
+                        {"doubleSided": True},
+                    )
+                ],
+            )
     with replacing(folder.path / "fields.npz") as partial:
         np.savez_compressed(partial, fields=fields.astype(np.float16))
     with replacing(folder.path / "samples.json") as partial:
-        partial.write_text(json.dumps({"seconds_per_sample": seconds / len(fields), "samples": told},
-                                      indent=1) + "\n", encoding="utf-8")
+        partial.write_text(
+            json.dumps({"seconds_per_sample": seconds / len(fields), "samples": told}, indent=1) + "\n",
+            encoding="utf-8",
+        )
     write_sheet(folder.path / "sheet.png", pictures, labels)
     if film:
         from ..turntable.video import write_video
 
         there_and_back = [*pictures, *pictures[-2:0:-1]]
-        write_video((frame / 255.0 for frame in there_and_back), folder.path / "interpolation.mp4", _FPS,
-                    gif=False)
-    return (f"{folder.path}: {counted(len(fields), 'sample')} in {seconds:.1f} s "
-            f"({seconds / len(fields):.2f} s each); see sheet.png")
+        write_video(
+            (frame / 255.0 for frame in there_and_back), folder.path / "interpolation.mp4", _FPS, gif=False
+        )
+    return (
+        f"{folder.path}: {counted(len(fields), 'sample')} in {seconds:.1f} s "
+        f"({seconds / len(fields):.2f} s each); see sheet.png"
+    )

@@ -31,18 +31,31 @@ def sample_fields(folder: Path, request: Request) -> tuple[np.ndarray, float]:
     none = len(model.config.classes)
     kinds = [none if kind is None else kind for kind in request.kinds]
     started, found = time.perf_counter(), []
-    columns = (TextColumn("sampling"), BarColumn(), TextColumn("{task.percentage:.0f} %"),
-               TimeRemainingColumn())
+    columns = (
+        TextColumn("sampling"),
+        BarColumn(),
+        TextColumn("{task.percentage:.0f} %"),
+        TimeRemainingColumn(),
+    )
     with Bars(*columns, quiet=request.quiet) as progress:
         batches = range(0, len(kinds), request.batch)
         bar = progress.add_task("", total=request.steps * len(batches))
         for first in batches:
             part = slice(first, first + request.batch)
-            steering = Steering(kinds[part], request.seeds[part], request.guidance, request.steps,
-                                request.start, request.strength, request.known)
+            steering = Steering(
+                kinds[part],
+                request.seeds[part],
+                request.guidance,
+                request.steps,
+                request.start,
+                request.strength,
+                request.known,
+            )
             try:
                 found.append(model.sample(steering, lambda: progress.advance(bar)))
             except torch.OutOfMemoryError as error:
-                raise UserError(f"The device has not enough memory for {request.batch} samples at once; give "
-                                f"a smaller --batch.") from error
+                raise UserError(
+                    f"The device has not enough memory for {request.batch} samples at once; give "
+                    f"a smaller --batch."
+                ) from error
     return np.concatenate(found), time.perf_counter() - started

@@ -102,6 +102,7 @@ def jensen_shannon_divergence(a: np.ndarray, b: np.ndarray) -> float:
     >>> jensen_shannon_divergence(points, points), jensen_shannon_divergence(points, points + 1)
     (0.0, 1.0)
     """
+
     def shares(points: np.ndarray) -> np.ndarray:
         cell = np.clip((points.reshape(-1, 3) + 1) / 2 * _JSD_CELLS, 0, _JSD_CELLS - 1).astype(int)
         number = cell @ np.array([1, _JSD_CELLS, _JSD_CELLS**2])

@@ -85,13 +85,17 @@ def mesh_sources(places: list[Path]) -> list[Source]:
             raise UserError(f"'{place}' does not exist; check the path.")
         here = _of_place(place)
         if not here:
-            raise UserError(f"'{place}' holds no mesh ({', '.join(MESH_FILES)}) and is no finished fit; give "
-                            f"another place.")
+            raise UserError(
+                f"'{place}' holds no mesh ({', '.join(MESH_FILES)}) and is no finished fit; give "
+                f"another place."
+            )
         found += here
     names = [source.name for source in found]
     if len(set(names)) < len(names):  # places with files of the same names
-        found = [Source(f"{index:06d}-{source.name}", source.kind, source.path)
-                 for index, source in enumerate(found)]
+        found = [
+            Source(f"{index:06d}-{source.name}", source.kind, source.path)
+            for index, source in enumerate(found)
+        ]
     return found
 
 
@@ -105,8 +109,11 @@ def _of_place(place: Path) -> list[Source]:
     fits = {path.parent for path in place.rglob(MARK) if _is_fit(path.parent)}
     for path in sorted(place.rglob("*")):
         inside = next((fit for fit in path.parents if fit in fits), None)
-        if not path.is_file() or path.suffix.lower() not in MESH_FILES or (
-                inside is not None and path != inside / "mesh.ply"):
+        if (
+            not path.is_file()
+            or path.suffix.lower() not in MESH_FILES
+            or (inside is not None and path != inside / "mesh.ply")
+        ):
             continue
         relative = path.relative_to(place)
         kind = relative.parts[0] if len(relative.parts) > (1 if inside is None else 2) else UNNAMED

@@ -68,8 +68,11 @@ def train(data_set: Path, output: Path, config: TrainConfig, *, quiet: bool = Tr
         data = DataSet.open(data_set)
         made = ModelConfig(config.model, config.size, data.side, tuple(data.classes))
         training = _loaded(data, config, run.device, held_out=False)
-        tests = _loaded(data, config, run.device, held_out=True) if run.first and any(
-            record.held_out for record in data.records) else None
+        tests = (
+            _loaded(data, config, run.device, held_out=True)
+            if run.first and any(record.held_out for record in data.records)
+            else None
+        )
         if not run.first:
             return _Training(config, made, run, None).run(training, None, quiet=True)
         output.mkdir(parents=True, exist_ok=True)
@@ -79,8 +82,10 @@ def train(data_set: Path, output: Path, config: TrainConfig, *, quiet: bool = Tr
             write_card(output, made, config, data)
             return _Training(config, made, run, folder).run(training, tests, quiet=quiet)
     except torch.OutOfMemoryError as error:
-        raise UserError(f"The device has not enough memory for batches of {config.batch}; give a smaller "
-                        f"--batch or --size, and the training goes on from its last checkpoint.") from error
+        raise UserError(
+            f"The device has not enough memory for batches of {config.batch}; give a smaller "
+            f"--batch or --size, and the training goes on from its last checkpoint."
+        ) from error
     finally:
         run.end()
 
@@ -128,13 +133,19 @@ class _Training:
     def run(self, data: TrainingSet, tests: TrainingSet | None, *, quiet: bool) -> str:
         self._begin_stage()
         self._resume()
-        columns = (TextColumn("training"), BarColumn(), TextColumn("{task.percentage:.0f} %"),
-                   TimeRemainingColumn(), TextColumn("{task.fields[told]}"))
+        columns = (
+            TextColumn("training"),
+            BarColumn(),
+            TextColumn("{task.percentage:.0f} %"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[told]}"),
+        )
         with Bars(*columns, quiet=quiet) as progress:
             bar = progress.add_task("", total=1.0, told="")
             while True:
-                self._train_stage(data, tests, lambda told: progress.update(
-                    bar, completed=self._share_of_all(), told=told))
+                self._train_stage(
+                    data, tests, lambda told: progress.update(bar, completed=self._share_of_all(), told=told)
+                )
                 self._take_best()
                 if self.stage + 1 == len(self.stages):
                     break
@@ -165,8 +176,13 @@ class _Training:
         self.ema = {name: value.detach().clone() for name, value in self.part.named_parameters()}
         self.best, self.best_weights = math.inf, {}
         self.rate = self.model.rate(self.name, self.config.rate)
-        self.optimizer = torch.optim.AdamW(self.part.parameters(), lr=self.rate, betas=(0.9, 0.99),
-                                           weight_decay=0.01, fused=self.processes.device.type == "cuda")
+        self.optimizer = torch.optim.AdamW(
+            self.part.parameters(),
+            lr=self.rate,
+            betas=(0.9, 0.99),
+            weight_decay=0.01,
+            fused=self.processes.device.type == "cuda",
+        )
 
     def _train_stage(self, data: TrainingSet, tests: TrainingSet | None, told: Callable[[str], None]) -> None:
         self.model.eval()
@@ -187,8 +203,16 @@ class _Training:
                     began = time.perf_counter()
                     loss = self._take_step(forward, prepared)
                     self.spent = self.spent.plus(_Spent(1, time.perf_counter() - began))
-                    self.waiting.append(({"stage": self.name, "step": self._all.step,
-                                          "seconds": round(self._all.seconds, 3)}, loss))
+                    self.waiting.append(
+                        (
+                            {
+                                "stage": self.name,
+                                "step": self._all.step,
+                                "seconds": round(self._all.seconds, 3),
+                            },
+                            loss,
+                        )
+                    )
                 if self.folder is None:
                     continue
                 if self.processes.device.type == "cpu" or len(self.waiting) >= _LOGGED:
@@ -200,7 +224,8 @@ class _Training:
                     self._save()
                     saved = time.perf_counter()
                 if self.stage + 1 == len(self.stages) and (
-                        math.floor(self._share() * self.config.pictures) > drawn):
+                    math.floor(self._share() * self.config.pictures) > drawn
+                ):
                     drawn += 1
                     self._draw()
             except KeyboardInterrupt:
@@ -307,8 +332,10 @@ class _Training:
         with replacing(self.folder.path / _CHECKPOINT) as partial:
             partial.write_bytes(save(tensors, told))
         with self._mean_weights():
-            half = {name: _halved(value.detach().cpu()).contiguous()
-                    for name, value in self.model.state_dict().items()}
+            half = {
+                name: _halved(value.detach().cpu()).contiguous()
+                for name, value in self.model.state_dict().items()
+            }
         with replacing(self.folder.path / "weights.safetensors") as partial:
             partial.write_bytes(save(half))
 
@@ -320,8 +347,9 @@ class _Training:
                     told = file.metadata()
                 self._restore(load_file(path), told)
             except Exception as error:  # the readers raise whatever they stumble over
-                raise UserError(f"'{path}' cannot be read ({type(error).__name__}); remove it to train from "
-                                f"the start.") from error
+                raise UserError(
+                    f"'{path}' cannot be read ({type(error).__name__}); remove it to train from the start."
+                ) from error
             self._cut_log()
         if self.processes.count > 1:
             self._share_state()
@@ -329,21 +357,27 @@ class _Training:
     def _restore(self, tensors: dict[str, torch.Tensor], told: dict[str, str]) -> None:
         device = self.processes.device
         self.stage, best = int(told["stage"]), float(told["best"])
-        self.earlier, self.spent = (_Spent(int(told[f"{name}.step"]), float(told[f"{name}.seconds"]))
-                                    for name in ("earlier", "spent"))
+        self.earlier, self.spent = (
+            _Spent(int(told[f"{name}.step"]), float(told[f"{name}.seconds"])) for name in ("earlier", "spent")
+        )
         self._begin_stage()
         self.best = best
         self.model.load_state_dict({name: tensors[f"model.{name}"] for name in self.model.state_dict()})
-        self.best_weights = {name: tensors[f"best.{name}"].to(device) for name in self.ema
-                             if f"best.{name}" in tensors}
+        self.best_weights = {
+            name: tensors[f"best.{name}"].to(device) for name in self.ema if f"best.{name}" in tensors
+        }
         self.ema = {name: tensors[f"ema.{name}"].to(device) for name in self.ema}
         for name, parameter in self.part.named_parameters():
-            state = {key: tensors[f"adam.{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq")
-                     if f"adam.{key}.{name}" in tensors}
+            state = {
+                key: tensors[f"adam.{key}.{name}"]
+                for key in ("step", "exp_avg", "exp_avg_sq")
+                if f"adam.{key}.{name}" in tensors
+            }
             if state:
                 self.optimizer.state[parameter] = {
                     key: value.to(device) if key != "step" or device.type == "cuda" else value
-                    for key, value in state.items()}
+                    for key, value in state.items()
+                }
 
     def _share_state(self) -> None:
         """Gives the first process's state to the others."""
@@ -377,8 +411,11 @@ class _Training:
         path = None if self.folder is None else self.folder.path / "log.jsonl"
         if path is None or not path.is_file():
             return
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines()
-                 if json.loads(line)["step"] <= self._all.step]
+        lines = [
+            line
+            for line in path.read_text(encoding="utf-8").splitlines()
+            if json.loads(line)["step"] <= self._all.step
+        ]
         with replacing(path) as partial:
             partial.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
 
@@ -388,15 +425,21 @@ class _Training:
             return
         kinds = [i % len(self.made.classes) for i in range(_DRAWN)]
         with self._mean_weights():
-            fields = self.model.sample(Steering(kinds, [(i, i, 0.0) for i in range(_DRAWN)],
-                                                steps=_DRAWN_STEPS))
+            fields = self.model.sample(
+                Steering(kinds, [(i, i, 0.0) for i in range(_DRAWN)], steps=_DRAWN_STEPS)
+            )
         name = f"samples/{self._all.step:07d}.png"
         self.folder.claim(name)
         (self.folder.path / "samples").mkdir(exist_ok=True)
         from .drawn import draw_fields
 
-        in_own_process(draw_fields, self.folder.path / name, fields, [self.made.classes[k] for k in kinds],
-                       variant="llvm_ad_rgb")
+        in_own_process(
+            draw_fields,
+            self.folder.path / name,
+            fields,
+            [self.made.classes[k] for k in kinds],
+            variant="llvm_ad_rgb",
+        )
 
 
 def _halved(value: torch.Tensor) -> torch.Tensor:
@@ -407,8 +450,13 @@ def _take_autoencoder(model: ShapeFlow | LatentFlow | DenseDiffusion, folder: Pa
     from .models.latent_flow import LatentFlow
 
     other = load_model(folder, torch.device("cpu"))
-    if not (isinstance(model, LatentFlow) and isinstance(other, LatentFlow)
-            and other.config.shape == model.config.shape):
-        raise UserError(f"The autoencoder of '{folder}' is none for a model of this kind and size; give "
-                        "another --size, or leave --autoencoder out.")
+    if not (
+        isinstance(model, LatentFlow)
+        and isinstance(other, LatentFlow)
+        and other.config.shape == model.config.shape
+    ):
+        raise UserError(
+            f"The autoencoder of '{folder}' is none for a model of this kind and size; give "
+            "another --size, or leave --autoencoder out."
+        )
     model.autoencoder.load_state_dict(other.autoencoder.state_dict())

@@ -40,8 +40,11 @@ def seen_points(folder: Path, mesh: trimesh.Trimesh, back: np.ndarray) -> np.nda
         parameters = mi.traverse(sensor)
         half = np.tan(np.radians(float(np.ravel(parameters["x_fov"])[0])) / 2)
         height = float(sensor.film().size()[1]) / float(sensor.film().size()[0])
-        inside = (local[:, 2] > 0) & (np.abs(local[:, 0]) < half * local[:, 2]) & (
-            np.abs(local[:, 1]) < half * height * local[:, 2])
+        inside = (
+            (local[:, 2] > 0)
+            & (np.abs(local[:, 0]) < half * local[:, 2])
+            & (np.abs(local[:, 1]) < half * height * local[:, 2])
+        )
         if not inside.any():
             continue
         toward = eye - world[inside]

@@ -21,7 +21,7 @@ class CameraSamples:
     time: mi.Float
     wavelength: mi.Float
     origin: tuple[int, int]  #: lowest pixel sampled, relative to the crop window
-    size: tuple[int, int]    #: extent in pixels of what is sampled
+    size: tuple[int, int]  #: extent in pixels of what is sampled
 
     @staticmethod
     def draw(sensor: mi.Sensor, sampler: mi.Sampler) -> CameraSamples:
@@ -41,15 +41,17 @@ class CameraSamples:
 
     def take(self, index: mi.UInt32) -> CameraSamples:
         """The samples with these numbers."""
-        time, wavelength = (x if dr.width(x) == 1 else dr.gather(mi.Float, x, index)
-                            for x in (self.time, self.wavelength))
+        time, wavelength = (
+            x if dr.width(x) == 1 else dr.gather(mi.Float, x, index) for x in (self.time, self.wavelength)
+        )
         return CameraSamples(dr.gather(mi.Point2f, self.u, index), time, wavelength, self.origin, self.size)
 
     def rays(self, sensor: mi.Sensor, u: mi.Point2f) -> tuple[mi.Ray3f, mi.Spectrum]:
         """Camera rays through film positions, attached to them and to the sensor."""
         film = sensor.film()
-        return sensor.sample_ray(self.time, self.wavelength, u / mi.Vector2f(film.crop_size()),
-                                 mi.Point2f(0.5))
+        return sensor.sample_ray(
+            self.time, self.wavelength, u / mi.Vector2f(film.crop_size()), mi.Point2f(0.5)
+        )
 
 
 def numbers_of(selected: mi.Bool) -> mi.UInt32:
@@ -57,9 +59,15 @@ def numbers_of(selected: mi.Bool) -> mi.UInt32:
     return dr.compress(selected | (dr.arange(mi.UInt32, dr.width(selected)) < 2))
 
 
-def not_lost(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, samples: CameraSamples,
-             sampler: mi.Sampler, warp: Warp,
-             seed: int) -> tuple[mi.UInt32 | None, CameraSamples, mi.Sampler]:
+def not_lost(
+    integrator: FilmIntegrator,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    samples: CameraSamples,
+    sampler: mi.Sampler,
+    warp: Warp,
+    seed: int,
+) -> tuple[mi.UInt32 | None, CameraSamples, mi.Sampler]:
     """The samples that see something or are close to a silhouette.
 
     The others are black whatever changes, so nothing need be traced for them: on a photograph of one object

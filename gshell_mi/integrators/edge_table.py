@@ -63,11 +63,10 @@ def first_with_equal_key(keys: list[mi.UInt32], active: mi.Bool) -> mi.UInt32:
         result = dr.select(done, found, result)
         slot = (slot + 1) & mask
         active &= ~done
-    dr.eval(result)     # what an atomic returned cannot be computed a second time
+    dr.eval(result)  # what an atomic returned cannot be computed a second time
     lowest = dr.full(mi.UInt32, _EMPTY, n)
     taking_part = result != _EMPTY
-    dr.scatter_reduce(dr.ReduceOp.Min, lowest, index, result, taking_part,
-                      mode=SIZE_INDEPENDENT)
+    dr.scatter_reduce(dr.ReduceOp.Min, lowest, index, result, taking_part, mode=SIZE_INDEPENDENT)
     return dr.select(taking_part, dr.gather(mi.UInt32, lowest, result, taking_part), _EMPTY)
 
 
@@ -76,11 +75,11 @@ class EdgeTable:
     """The directed edges of a mesh (three per face, in face order) and the edge each belongs to."""
 
     start: mi.UInt32  #: 3F: first vertex, an index into the mesh's own vertex buffer
-    end: mi.UInt32    #: 3F: second vertex
-    edge: mi.UInt32   #: 3F: representative directed edge
+    end: mi.UInt32  #: 3F: second vertex
+    edge: mi.UInt32  #: 3F: representative directed edge
     forward: mi.Bool  #: 3F: whether it runs from the lower to the higher welded vertex
-    valid: mi.Bool    #: 3F: false for the edges of degenerate and of repeated faces
-    split: mi.Bool    #: 3F: its faces have different copies of an end point (at representatives)
+    valid: mi.Bool  #: 3F: false for the edges of degenerate and of repeated faces
+    split: mi.Bool  #: 3F: its faces have different copies of an end point (at representatives)
     degree: mi.Int32  #: 3F: number of faces at the edge, stored at its representative
 
 
@@ -109,8 +108,10 @@ def build_edge_table(positions: mi.Float, faces: mi.UInt32) -> EdgeTable:
 
     vertex = dr.arange(mi.UInt32, vertex_count)
     # Adding zero turns -0 into +0, which compares equal but has other bits.
-    words = [dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, positions, 3 * vertex + k) + 0.0)
-             for k in range(3)]
+    words = [
+        dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, positions, 3 * vertex + k) + 0.0)
+        for k in range(3)
+    ]
     welded = first_with_equal_key(words, dr.full(mi.Bool, True, vertex_count))
     corner = dr.arange(mi.UInt32, corner_count)
     face = corner // 3
@@ -141,9 +142,11 @@ def _first_with_equal_corners(welded: mi.UInt32, faces: mi.UInt32) -> mi.UInt32:
 
 def scene_edge_tables(scene: mi.Scene) -> list[tuple[mi.Mesh, EdgeTable]]:
     """Pairs of each mesh of the scene that has faces and its ``EdgeTable``."""
-    return [(shape, build_edge_table(shape.vertex_positions_buffer(), shape.faces_buffer()))
-            for shape in scene.shapes()
-            if shape.is_mesh() and shape.face_count() > 0 and shape.vertex_count() > 2]
+    return [
+        (shape, build_edge_table(shape.vertex_positions_buffer(), shape.faces_buffer()))
+        for shape in scene.shapes()
+        if shape.is_mesh() and shape.face_count() > 0 and shape.vertex_count() > 2
+    ]
 
 
 def join(arrays: list[ArrayT]) -> ArrayT:

@@ -26,13 +26,13 @@ class EdgeWedges:
     """Edges of all meshes; angles are around the axis from the first face, ``low <= 0 <= high``."""
 
     positions: mi.Float  #: attached: the vertices of all meshes, interleaved
-    start: mi.UInt32     #: first vertex
-    end: mi.UInt32       #: second vertex
+    start: mi.UInt32  #: first vertex
+    end: mi.UInt32  #: second vertex
     opposite: mi.UInt32  #: third vertex of the first face
-    low: mi.Float        #: lowest angle of a face, above -pi
-    high: mi.Float       #: highest angle of a face, below pi
-    crease: mi.Bool      #: whether the film warp follows it wherever it is seen
-    meshes: int          #: how many meshes have edges
+    low: mi.Float  #: lowest angle of a face, above -pi
+    high: mi.Float  #: highest angle of a face, below pi
+    crease: mi.Bool  #: whether the film warp follows it wherever it is seen
+    meshes: int  #: how many meshes have edges
     mesh_mass: mi.Float  #: sum of length times opening over the edges of its mesh
 
     def opening(self) -> mi.Float:
@@ -42,8 +42,10 @@ class EdgeWedges:
     def frame(self, index: mi.UInt32) -> tuple[mi.Point3f, mi.Point3f, mi.Vector3f, mi.Vector3f, mi.Vector3f]:
         """Of edges by index: end points, unit axis, and the unit vectors at angles 0 and 90 degrees."""
         flat = dr.detach(self.positions)
-        p, q, r = (dr.gather(mi.Point3f, flat, dr.gather(mi.UInt32, x, index))
-                   for x in (self.start, self.end, self.opposite))
+        p, q, r = (
+            dr.gather(mi.Point3f, flat, dr.gather(mi.UInt32, x, index))
+            for x in (self.start, self.end, self.opposite)
+        )
         return p, q, *_frame(p, q, r)
 
 
@@ -54,16 +56,18 @@ def _frame(p: mi.Point3f, q: mi.Point3f, r: mi.Point3f) -> tuple[mi.Vector3f, mi
     return axis, inward, dr.cross(axis, inward)
 
 
-def silhouette_for(direction: mi.Vector3f, inward: mi.Vector3f, across: mi.Vector3f, low: mi.Float,
-                   high: mi.Float) -> mi.Bool:
+def silhouette_for(
+    direction: mi.Vector3f, inward: mi.Vector3f, across: mi.Vector3f, low: mi.Float, high: mi.Float
+) -> mi.Bool:
     """Whether a line of the given direction through an edge has all its faces on one side."""
     x, y = dr.dot(direction, inward), dr.dot(direction, across)
     at_low, at_high = (y * dr.cos(a) - x * dr.sin(a) for a in (low, high))
     return (at_low * at_high > 0) & (dr.pi - (high - low) > _FLAT)
 
 
-def build_edge_wedges(tables: list[tuple[mi.Mesh, EdgeTable]],
-                      crease_angle: float = 0.1) -> EdgeWedges | None:
+def build_edge_wedges(
+    tables: list[tuple[mi.Mesh, EdgeTable]], crease_angle: float = 0.1
+) -> EdgeWedges | None:
     """The wedges of all edges of the meshes of ``scene_edge_tables``, or ``None`` without edges."""
     parts, buffers, offset = [], [], 0
     for mesh, table in tables:
@@ -81,8 +85,9 @@ def build_edge_wedges(tables: list[tuple[mi.Mesh, EdgeTable]],
     return EdgeWedges(positions, *columns[:-1], meshes=len(parts), mesh_mass=columns[-1])
 
 
-def _mesh_wedges(mesh: mi.Mesh, table: EdgeTable, crease_angle: float,
-                 offset: mi.UInt32) -> list[AnyArray] | None:
+def _mesh_wedges(
+    mesh: mi.Mesh, table: EdgeTable, crease_angle: float, offset: mi.UInt32
+) -> list[AnyArray] | None:
     positions, faces = dr.detach(mesh.vertex_positions_buffer()), mesh.faces_buffer()
     n = dr.width(faces)
     corner = dr.arange(mi.UInt32, n)
@@ -92,8 +97,10 @@ def _mesh_wedges(mesh: mi.Mesh, table: EdgeTable, crease_angle: float,
     dr.eval(opposite)
 
     own = dr.gather(mi.Point3f, positions, opposite)
-    p, q, r = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, x, table.edge, table.valid))
-               for x in (table.start, table.end, opposite))
+    p, q, r = (
+        dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, x, table.edge, table.valid))
+        for x in (table.start, table.end, opposite)
+    )
     axis, inward, across = _frame(p, q, r)
     towards = own - p
     towards -= axis * dr.dot(axis, towards)
@@ -109,11 +116,19 @@ def _mesh_wedges(mesh: mi.Mesh, table: EdgeTable, crease_angle: float,
     if dr.width(keep) == 0:
         return None
     start, end, opposite, low, high, crease = (
-        dr.gather(type(x), x, keep) for x in (table.start, table.end, opposite, low, high, crease))
+        dr.gather(type(x), x, keep) for x in (table.start, table.end, opposite, low, high, crease)
+    )
     p, q = dr.gather(mi.Point3f, positions, start), dr.gather(mi.Point3f, positions, end)
     mass = dr.sum(dr.norm(q - p) * (dr.pi - (high - low)))
     dr.make_opaque(mass)
-    result = [start + offset, end + offset, opposite + offset, low, high, crease,
-              mass + dr.zeros(mi.Float, dr.width(keep))]
+    result = [
+        start + offset,
+        end + offset,
+        opposite + offset,
+        low,
+        high,
+        crease,
+        mass + dr.zeros(mi.Float, dr.width(keep)),
+    ]
     dr.eval(result)
     return result

@@ -36,8 +36,9 @@ class FilmIntegrator(Protocol):
         """Radiance and coverage along camera rays."""
         ...
 
-    def boundary_terms(self, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor,
-                       seed: int) -> Iterable[BoundaryTerm]:
+    def boundary_terms(
+        self, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor, seed: int
+    ) -> Iterable[BoundaryTerm]:
         """What moves over the film other than the silhouettes."""
         ...
 
@@ -45,9 +46,16 @@ class FilmIntegrator(Protocol):
         """Whether ``attached`` needs to know the radiance and coverage of its samples beforehand."""
         ...
 
-    def attached(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f,
-                 state: PathSample | None, on_sample: OnSample,
-                 film_terms: Sequence[AnyArray] = ()) -> tuple[Any, Any]:
+    def attached(
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        state: PathSample | None,
+        on_sample: OnSample,
+        film_terms: Sequence[AnyArray] = (),
+    ) -> tuple[Any, Any]:
         """Derivatives of camera paths: in reverse mode a ``Float`` that carries them, and the samples; in
         forward mode the channels' tangents, and those of ``film_terms``."""
         ...

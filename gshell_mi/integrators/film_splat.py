@@ -43,8 +43,7 @@ class FilmSplat:
         radius = self.rfilter.radius()
         self.taps = 1 if self.box else int(dr.ceil(2 * radius - 1e-3))
         # Lowest pixel whose centre is within the filter's reach
-        self.base = (mi.Point2i(dr.floor(self.u)) if self.box else
-                     mi.Point2i(dr.ceil(self.u - (radius + 0.5))))
+        self.base = mi.Point2i(dr.floor(self.u)) if self.box else mi.Point2i(dr.ceil(self.u - (radius + 0.5)))
         self.expected = [self._expected_weight(n) for n in (self.width, self.height)]
         self.expected[0] *= spp
 
@@ -138,8 +137,10 @@ class FilmSplat:
         pixel = dr.arange(mi.UInt32, n)
         share = (self.spp - self.spp // 2) / self.spp
         second = pixel + dr.opaque(mi.UInt32, n)
-        return [share * dr.gather(mi.Float, c, pixel) + (1 - share) * dr.gather(mi.Float, c, second)
-                for c in self._control()]
+        return [
+            share * dr.gather(mi.Float, c, pixel) + (1 - share) * dr.gather(mi.Float, c, second)
+            for c in self._control()
+        ]
 
     def _half(self, index: mi.UInt32) -> mi.UInt32:
         """Which half the samples with these numbers belong to."""
@@ -196,8 +197,9 @@ class FilmSplat:
             on_det += h * contrast
         return on_shift, on_det
 
-    def tangent(self, value_tangents: list[mi.Float], shift: mi.Vector2f,
-                divergence: mi.Float) -> list[mi.Float]:
+    def tangent(
+        self, value_tangents: list[mi.Float], shift: mi.Vector2f, divergence: mi.Float
+    ) -> list[mi.Float]:
         """The image tangent for tangents of the values, of T(u) - u and of det."""
         control = self._control()
         half = self._half(dr.arange(mi.UInt32, dr.width(self.u)))

@@ -42,29 +42,44 @@ class GShellMaskIntegrator(ADIntegrator):
         super().__init__(props)
         self.warp_radius = props.get("warp_radius", 2.0)
         self.cull_hidden = props.get("cull_hidden", True)
-        self.said = set()   # warnings given so far
+        self.said = set()  # warnings given so far
         self.crease_angle = props.get("crease_angle", 0.1)
 
     def aov_names(self) -> list[str]:
         return ["depth", "normal.x", "normal.y", "normal.z"]
 
-    def sample(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f,
-               active: mi.Bool | bool = True,
-               **kwargs: Any) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], None]:
+    def sample(
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        active: mi.Bool | bool = True,
+        **kwargs: Any,
+    ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], None]:
         check_meshes(scene)
         result = self.primal(scene, sampler, ray, active)
         return result.value, result.alpha > 0.5, result.aovs, None
 
-    def render_forward(self, scene: mi.Scene, params: Any, sensor: int | mi.Sensor = 0, seed: int = 0,
-                       spp: int = 0) -> mi.TensorXf:
+    def render_forward(
+        self, scene: mi.Scene, params: Any, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0
+    ) -> mi.TensorXf:
         return reparameterised_film.render_forward(self, scene, sensor, seed, spp)
 
-    def render_backward(self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: int | mi.Sensor = 0,
-                        seed: int = 0, spp: int = 0) -> None:
+    def render_backward(
+        self,
+        scene: mi.Scene,
+        params: Any,
+        grad_in: mi.TensorXf,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+    ) -> None:
         reparameterised_film.render_backward(self, scene, grad_in, sensor, seed, spp)
 
-    def primal(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f,
-               active: mi.Bool | bool = True) -> PathSample:
+    def primal(
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool | bool = True
+    ) -> PathSample:
         """The first hit along camera rays; attached to whatever ``ray`` and the scene are."""
         with dr.suspend_grad():
             pi = scene.ray_intersect_preliminary(dr.detach(mi.Ray3f(ray)), coherent=True, active=active)
@@ -75,8 +90,9 @@ class GShellMaskIntegrator(ADIntegrator):
         normal = dr.select(hit, si.sh_frame.n, 0)
         return PathSample(mi.Spectrum(alpha), alpha, [depth, normal.x, normal.y, normal.z])
 
-    def boundary_terms(self, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor,
-                       seed: int) -> Iterable[BoundaryTerm]:
+    def boundary_terms(
+        self, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor, seed: int
+    ) -> Iterable[BoundaryTerm]:
         """None: the AOVs of the first hit jump at silhouettes only."""
         return ()
 
@@ -84,9 +100,16 @@ class GShellMaskIntegrator(ADIntegrator):
         """See ``GShellPathIntegrator.replays``."""
         return False
 
-    def attached(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f,
-                 state: PathSample | None, on_sample: OnSample,
-                 film_terms: Sequence[AnyArray] = ()) -> tuple[Any, Any]:
+    def attached(
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        state: PathSample | None,
+        on_sample: OnSample,
+        film_terms: Sequence[AnyArray] = (),
+    ) -> tuple[Any, Any]:
         """See ``GShellPathIntegrator.attached``."""
         now = self.primal(scene, sampler, ray)
         if mode == dr.ADMode.Backward:

@@ -69,38 +69,60 @@ class GShellPathIntegrator(ADIntegrator):
         self.reparam_depth = props.get("reparam_depth", 3)
         if self.reparam_depth not in (1, 2, 3):
             raise UserError(f"gshell_path: reparam_depth is {self.reparam_depth}, but has to be 1, 2 or 3.")
-        self.said = set()   # warnings given so far
+        self.said = set()  # warnings given so far
         self.crease_angle = props.get("crease_angle", 0.1)
         self.light_edge_samples = props.get("light_edge_samples", 1.0)
 
     # ------------------------------------------------------------------ rendering
 
-    def sample(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f,
-               active: mi.Bool | bool = True,
-               **kwargs: Any) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], None]:
+    def sample(
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        active: mi.Bool | bool = True,
+        **kwargs: Any,
+    ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], None]:
         check_meshes(scene)
         result = self.primal(scene, sampler, mi.Ray3f(ray), active, max_depth=self.max_depth)
         return result.value, result.alpha > 0.5, result.aovs, None
 
-    def render(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0,
-               develop: bool = True, evaluate: bool = True) -> mi.TensorXf:
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
         if not develop:
             return super().render(scene, sensor, seed, spp, develop, evaluate)
         return primal_film.render(self, scene, sensor, seed, spp)
 
-    def render_forward(self, scene: mi.Scene, params: Any, sensor: int | mi.Sensor = 0, seed: int = 0,
-                       spp: int = 0) -> mi.TensorXf:
+    def render_forward(
+        self, scene: mi.Scene, params: Any, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0
+    ) -> mi.TensorXf:
         return reparameterised_film.render_forward(self, scene, sensor, seed, spp)
 
-    def render_backward(self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: int | mi.Sensor = 0,
-                        seed: int = 0, spp: int = 0) -> None:
+    def render_backward(
+        self,
+        scene: mi.Scene,
+        params: Any,
+        grad_in: mi.TensorXf,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+    ) -> None:
         with phase("render backward"):
             reparameterised_film.render_backward(self, scene, grad_in, sensor, seed, spp)
 
     # ------------------------------------------------------------------ paths
 
-    def first_hit(self, scene: mi.Scene, ray: mi.Ray3f,
-                  active: mi.Bool | bool = True) -> mi.PreliminaryIntersection3f:
+    def first_hit(
+        self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool | bool = True
+    ) -> mi.PreliminaryIntersection3f:
         """The first intersection, behind the area lights if emitters are hidden."""
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         if self.hide_emitters and has_surface_emitters(scene):
@@ -110,8 +132,15 @@ class GShellPathIntegrator(ADIntegrator):
         return pi
 
     @dr.syntax
-    def primal(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool | bool = True,
-               start: int = 0, max_depth: int | None = None) -> PathSample:
+    def primal(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        active: mi.Bool | bool = True,
+        start: int = 0,
+        max_depth: int | None = None,
+    ) -> PathSample:
         """Radiance and coverage along camera rays, without derivatives; by default, what is differentiated.
 
         With ``start`` = 1 the rays are those of a second segment instead: the light that arrives
@@ -122,7 +151,7 @@ class GShellPathIntegrator(ADIntegrator):
         depth = mi.UInt32(start)
         L, beta, eta = mi.Spectrum(0), mi.Spectrum(1), mi.Float(1)
         active = mi.Bool(active)
-        scattered = mi.Bool(start > 0)     # past the surfaces that camera rays just pass through
+        scattered = mi.Bool(start > 0)  # past the surfaces that camera rays just pass through
         transparent = has_bsdf_flag(scene, mi.BSDFFlags.Null)
         if dr.hint(start == 0, mode="scalar"):
             pi = self.first_hit(scene, ray, active)
@@ -159,8 +188,16 @@ class GShellPathIntegrator(ADIntegrator):
         L = dr.select(dr.all(dr.isfinite(L)), L, 0)
         return PathSample(L, dr.select(covered, mi.Float(1), mi.Float(0)), [])
 
-    def emission(self, scene: mi.Scene, si: mi.SurfaceInteraction3f, si_prev: mi.SurfaceInteraction3f,
-                 pdf_prev: mi.Float, delta_prev: mi.Bool, scattered: mi.Bool, active: mi.Bool) -> mi.Spectrum:
+    def emission(
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        si_prev: mi.SurfaceInteraction3f,
+        pdf_prev: mi.Float,
+        delta_prev: mi.Bool,
+        scattered: mi.Bool,
+        active: mi.Bool,
+    ) -> mi.Spectrum:
         """Light emitted at a vertex towards the one before, weighted against emitter sampling."""
         if self.hide_emitters:
             active = active & (scattered | si.is_valid())
@@ -168,8 +205,9 @@ class GShellPathIntegrator(ADIntegrator):
         emitter_pdf = scene.pdf_emitter_direction(si_prev, ds, ~delta_prev)
         return mis_weight(pdf_prev, emitter_pdf) * ds.emitter.eval(si, active)
 
-    def roulette(self, beta: mi.Spectrum, eta: mi.Float, depth: mi.UInt32, sampler: mi.Sampler,
-                 active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
+    def roulette(
+        self, beta: mi.Spectrum, eta: mi.Float, depth: mi.UInt32, sampler: mi.Sampler, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Bool]:
         peak = dr.max(mi.unpolarized_spectrum(beta))
         survive = dr.minimum(peak * dr.square(eta), 0.95)
         play = depth >= self.rr_depth
@@ -179,8 +217,9 @@ class GShellPathIntegrator(ADIntegrator):
 
     # ------------------------------------------------------------------ shadows
 
-    def boundary_terms(self, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor,
-                       seed: int) -> Iterable[BoundaryTerm]:
+    def boundary_terms(
+        self, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor, seed: int
+    ) -> Iterable[BoundaryTerm]:
         """Yields the ``BoundaryTerm`` of shadows."""
         return shadow_boundary.boundary_terms(self, scene, tables, sensor, seed)
 
@@ -188,9 +227,16 @@ class GShellPathIntegrator(ADIntegrator):
         """Whether ``attached`` needs to know the radiance and coverage of its samples beforehand."""
         return self.gradient_depth > 3 or has_bsdf_flag(scene, mi.BSDFFlags.Delta)
 
-    def attached(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f,
-                 state: PathSample | None, on_sample: OnSample,
-                 film_terms: Sequence[AnyArray] = ()) -> tuple[Any, Any]:
+    def attached(
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        state: PathSample | None,
+        on_sample: OnSample,
+        film_terms: Sequence[AnyArray] = (),
+    ) -> tuple[Any, Any]:
         """Derivatives of camera paths.
 
         ``ray`` is attached to the film warp and the sensor; ``state`` is what ``primal`` returned for
@@ -205,8 +251,13 @@ class GShellPathIntegrator(ADIntegrator):
             total = on_sample(radiance, alpha, state.aovs)
             if tail is not None:
                 with dr.suspend_grad():
-                    on_last = replay(self, mode, *tail, adjoint=_adjoint_of_value(on_sample, state),
-                                     p_tangent=mi.Vector3f(0))
+                    on_last = replay(
+                        self,
+                        mode,
+                        *tail,
+                        adjoint=_adjoint_of_value(on_sample, state),
+                        p_tangent=mi.Vector3f(0),
+                    )
                 total += dr.dot(last, on_last)
             return total, state
         # Interior gradients are results too, and the replay needs those of the inputs again.
@@ -215,12 +266,13 @@ class GShellPathIntegrator(ADIntegrator):
         film_tangents = [dr.grad(x) for x in film_terms]
         if tail is not None:
             with dr.suspend_grad():
-                tangent += replay(self, mode, *tail, adjoint=mi.Spectrum(0),
-                                  p_tangent=mi.Vector3f(dr.grad(last)))
+                tangent += replay(
+                    self, mode, *tail, adjoint=mi.Spectrum(0), p_tangent=mi.Vector3f(dr.grad(last))
+                )
         return on_sample(tangent, alpha_tangent, []), film_tangents
 
     def _first_vertices(
-        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, state: PathSample | None,
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, state: PathSample | None
     ) -> tuple[mi.Spectrum, mi.Float, mi.Point3f, tuple[Any, ...] | None]:
         """The first two vertices of each path, whose motions depend on each other, attached.
 
@@ -241,7 +293,7 @@ class GShellPathIntegrator(ADIntegrator):
         no_vertex = dr.zeros(mi.SurfaceInteraction3f)
         radiance = self.emission(scene, si, no_vertex, mi.Float(1), mi.Bool(True), mi.Bool(False), active)
         scattered = mi.Bool(False)
-        throughput = mi.Spectrum(1)     # of value 1, carries the derivatives of the vertices so far
+        throughput = mi.Spectrum(1)  # of value 1, carries the derivatives of the vertices so far
         beta, eta = mi.Spectrum(1), mi.Float(1)
         always = not self.hide_emitters and scene.environment() is not None
         if state is None:
@@ -252,8 +304,11 @@ class GShellPathIntegrator(ADIntegrator):
         for vertex in range(min(self.gradient_depth - 1, 2)):
             active &= (depth + 1 < self.gradient_depth) & si.is_valid()
             si_now = dr.detach(si)
-            radiance += throughput * beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active, True,
-                                                          surface_emitters)
+            radiance += (
+                throughput
+                * beta
+                * sample_direct(scene, si, bsdf, sampler.next_2d(), active, True, surface_emitters)
+            )
             choice, sample2 = sampler.next_1d(), sampler.next_2d()
             with dr.suspend_grad():
                 sample, weight = bsdf.sample(context, si_now, choice, sample2, active)
@@ -264,17 +319,21 @@ class GShellPathIntegrator(ADIntegrator):
                 beta, active = self.roulette(beta * weight, eta, depth, sampler, active)
                 pi = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active)
             depth = depth + 1
-            to_point = mi.Spectrum(0)   # replaced wherever it counts
+            to_point = mi.Spectrum(0)  # replaced wherever it counts
             if surface_emitters or vertex == 1:
                 p_next, area_next = material_point(pi, ray_next, active)
                 d, solid_angle = segment(si.p, p_next, area_next, active & pi.is_valid(), ray_next.d)
                 to_point = throughput * scattering(bsdf, si, d, solid_angle, sample, active, special)
             if vertex == 1:
-                if not deeper:    # else the replay counts what the last vertex emits
+                if not deeper:  # else the replay counts what the last vertex emits
                     last = pi.compute_surface_interaction(
-                        ray_next, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-                    radiance += to_point * beta * self.emission(scene, last, si_now, sample.pdf, delta,
-                                                                 scattered, active)
+                        ray_next, mi.RayFlags.All | mi.RayFlags.FollowShape, active
+                    )
+                    radiance += (
+                        to_point
+                        * beta
+                        * self.emission(scene, last, si_now, sample.pdf, delta, scattered, active)
+                    )
                 break
             # Light of emitters arrives from a point of theirs, all other along a fixed direction: in
             # these forms the integrand moves least, and emitter sampling uses the same.
@@ -282,8 +341,9 @@ class GShellPathIntegrator(ADIntegrator):
             along.o = dr.replace_grad(ray_next.o, si.p)
             change = dr.relative_grad(bsdf.eval(context, si, si.to_local(ray_next.d), active))
             if special:
-                d, change, seen = delta_lobe(bsdf, si, ray, ray_next, choice, sample2, delta, active,
-                                                   sample.sampled_type, change)
+                d, change, seen = delta_lobe(
+                    bsdf, si, ray, ray_next, choice, sample2, delta, active, sample.sampled_type, change
+                )
                 alpha *= 1 if always else seen
                 along.d = dr.replace_grad(ray_next.d, d)
             throughput = throughput * change
@@ -301,13 +361,33 @@ class GShellPathIntegrator(ADIntegrator):
         assert state is not None, "replays(scene) has asked for it"
         rest = state.value - dr.detach(radiance)
         radiance += dr.select(active, to_point * rest, 0)
-        return radiance, alpha, si.p, (scene, sampler, ray_next, pi, si_now, rest, beta, eta, sample.pdf,
-                                       delta, active, depth, scattered)
+        return (
+            radiance,
+            alpha,
+            si.p,
+            (
+                scene,
+                sampler,
+                ray_next,
+                pi,
+                si_now,
+                rest,
+                beta,
+                eta,
+                sample.pdf,
+                delta,
+                active,
+                depth,
+                scattered,
+            ),
+        )
 
     def to_string(self) -> str:
-        return (f"GShellPathIntegrator[max_depth={self.max_depth}, rr_depth={self.rr_depth}, "
-                f"gradient_depth={self.gradient_depth}, hide_emitters={self.hide_emitters}, "
-                f"reparam_depth={self.reparam_depth}, warp_radius={self.warp_radius}]")
+        return (
+            f"GShellPathIntegrator[max_depth={self.max_depth}, rr_depth={self.rr_depth}, "
+            f"gradient_depth={self.gradient_depth}, hide_emitters={self.hide_emitters}, "
+            f"reparam_depth={self.reparam_depth}, warp_radius={self.warp_radius}]"
+        )
 
 
 def _adjoint_of_value(on_sample: OnSample, state: PathSample) -> mi.Spectrum:

@@ -15,11 +15,25 @@ if TYPE_CHECKING:
 
 
 @dr.syntax
-def replay(integrator: GShellPathIntegrator, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler,
-           ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, si_prev: mi.SurfaceInteraction3f, L: mi.Spectrum,
-           beta: mi.Spectrum, eta: mi.Float, pdf_prev: mi.Float, delta_prev: mi.Bool, active: mi.Bool,
-           depth: mi.UInt32, scattered: mi.Bool, adjoint: mi.Spectrum,
-           p_tangent: mi.Vector3f) -> mi.Vector3f | mi.Spectrum:
+def replay(
+    integrator: GShellPathIntegrator,
+    mode: dr.ADMode,
+    scene: mi.Scene,
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    pi: mi.PreliminaryIntersection3f,
+    si_prev: mi.SurfaceInteraction3f,
+    L: mi.Spectrum,
+    beta: mi.Spectrum,
+    eta: mi.Float,
+    pdf_prev: mi.Float,
+    delta_prev: mi.Bool,
+    active: mi.Bool,
+    depth: mi.UInt32,
+    scattered: mi.Bool,
+    adjoint: mi.Spectrum,
+    p_tangent: mi.Vector3f,
+) -> mi.Vector3f | mi.Spectrum:
     """Path replay (Vicini et al. 2021) of the remaining vertices.
 
     Reverse mode takes the adjoint of the radiance and returns that of the position of the vertex
@@ -43,7 +57,8 @@ def replay(integrator: GShellPathIntegrator, mode: dr.ADMode, scene: mi.Scene, s
             if dr.hint(not backward, mode="scalar"):
                 dr.set_grad(p_first, p_tangent)
             p_prev = pi_prev.compute_surface_interaction(
-                ray_prev, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, active & ~second).p
+                ray_prev, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, active & ~second
+            ).p
             p_prev = dr.select(second, p_first, p_prev)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
             wi = si.to_local(dr.normalize(p_prev - si.p))
@@ -53,10 +68,12 @@ def replay(integrator: GShellPathIntegrator, mode: dr.ADMode, scene: mi.Scene, s
         bsdf = si_now.bsdf(mi.RayDifferential3f(ray))
         active_next = active & (depth + 1 < integrator.gradient_depth) & si_now.is_valid()
         with dr.resume_grad():
-            direct = beta * sample_direct(scene, si, bsdf, sampler.next_2d(), active_next, True,
-                                          surface_emitters)
-        sample, weight = bsdf.sample(mi.BSDFContext(), si_now, sampler.next_1d(), sampler.next_2d(),
-                                     active_next)
+            direct = beta * sample_direct(
+                scene, si, bsdf, sampler.next_2d(), active_next, True, surface_emitters
+            )
+        sample, weight = bsdf.sample(
+            mi.BSDFContext(), si_now, sampler.next_1d(), sampler.next_2d(), active_next
+        )
         L -= dr.detach(emitted) + dr.detach(direct)
         ray_next = si_now.spawn_ray(si_now.to_world(sample.wo))
         beta *= weight
@@ -65,8 +82,7 @@ def replay(integrator: GShellPathIntegrator, mode: dr.ADMode, scene: mi.Scene, s
         pi_next = scene.ray_intersect_preliminary(ray_next, coherent=False, active=active_next)
         with dr.resume_grad():
             p_next, area_next = material_point(pi_next, ray_next, active_next)
-            d, solid_angle = segment(si.p, p_next, area_next, active_next & pi_next.is_valid(),
-                                     ray_next.d)
+            d, solid_angle = segment(si.p, p_next, area_next, active_next & pi_next.is_valid(), ray_next.d)
             change = scattering(bsdf, si, d, solid_angle, sample, active_next, special)
             indirect = dr.select(active_next, L * change, 0)
             radiance = emitted + direct + indirect

@@ -11,6 +11,6 @@ import mitsuba as mi
 class PathSample:
     """Radiance, coverage and arbitrary output variables of a camera ray."""
 
-    value: mi.Spectrum    #: radiance
-    alpha: mi.Float       #: coverage
+    value: mi.Spectrum  #: radiance
+    alpha: mi.Float  #: coverage
     aovs: list[mi.Float]  #: one per output variable

@@ -22,8 +22,9 @@ def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
     return dr.select(a2 > 0, a2 / (a2 + b2), 0)
 
 
-def material_point(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f,
-                   active: mi.Bool) -> tuple[mi.Point3f, mi.Vector3f]:
+def material_point(
+    pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
+) -> tuple[mi.Point3f, mi.Vector3f]:
     """The hit as a point of its surface: position and ``n dA``, attached to the shape.
 
     ``n dA`` is the surface normal times the local stretch of area relative to now; only its
@@ -37,8 +38,9 @@ def material_point(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f,
     return si.p, si.n * dr.relative_grad(area)
 
 
-def segment(p: mi.Point3f, p_next: mi.Point3f, area_next: mi.Vector3f, valid: mi.Bool,
-            d: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
+def segment(
+    p: mi.Point3f, p_next: mi.Point3f, area_next: mi.Vector3f, valid: mi.Bool, d: mi.Vector3f
+) -> tuple[mi.Vector3f, mi.Float]:
     """Direction to a material point, and the derivative of its solid angle as a factor of value 1.
 
     ``d``: the direction's present value, kept where ``valid`` is false (the ray left the scene).
@@ -51,8 +53,15 @@ def segment(p: mi.Point3f, p_next: mi.Point3f, area_next: mi.Vector3f, valid: mi
     return (dr.replace_grad(d, dr.select(valid, direction, d)), dr.relative_grad(solid_angle))
 
 
-def sample_direct(scene: mi.Scene, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, sample: mi.Point2f,
-                  active: mi.Bool, attached: bool, surface_emitters: bool) -> mi.Spectrum:
+def sample_direct(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDF,
+    sample: mi.Point2f,
+    active: mi.Bool,
+    attached: bool,
+    surface_emitters: bool,
+) -> mi.Spectrum:
     """Light that one emitter sample sends through the vertex, weighted against BSDF sampling.
 
     Args:
@@ -87,8 +96,15 @@ def sample_direct(scene: mi.Scene, si: mi.SurfaceInteraction3f, bsdf: mi.BSDF, s
     return dr.select(active, dr.select(ds.delta, 1, mis_weight(pdf, bsdf_pdf)) * value * weight, 0)
 
 
-def scattering(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, d: mi.Vector3f, solid_angle: mi.Float,
-               sample: mi.BSDFSample3f, active: mi.Bool, special: bool) -> mi.Spectrum:
+def scattering(
+    bsdf: mi.BSDF,
+    si: mi.SurfaceInteraction3f,
+    d: mi.Vector3f,
+    solid_angle: mi.Float,
+    sample: mi.BSDFSample3f,
+    active: mi.Bool,
+    special: bool,
+) -> mi.Spectrum:
     """Factor of value 1 with the derivative of scattering towards a point.
 
     Where light just passes through (``mask``), of the transmission; the geometry of such a
@@ -101,9 +117,18 @@ def scattering(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, d: mi.Vector3f, solid
     return dr.select(passes, dr.relative_grad(bsdf.eval_null_transmission(si, active)), change)
 
 
-def delta_lobe(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, ray_next: mi.Ray3f,
-               choice: mi.Float, sample2: mi.Point2f, delta: mi.Bool, active: mi.Bool, kind: mi.UInt32,
-               change: mi.Spectrum) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
+def delta_lobe(
+    bsdf: mi.BSDF,
+    si: mi.SurfaceInteraction3f,
+    ray: mi.Ray3f,
+    ray_next: mi.Ray3f,
+    choice: mi.Float,
+    sample2: mi.Point2f,
+    delta: mi.Bool,
+    active: mi.Bool,
+    kind: mi.UInt32,
+    change: mi.Spectrum,
+) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
     """Direction, and relative weight and coverage, where the first surface scatters in one direction.
 
     A mirrored or refracted direction follows the surface, and one that passes through (``mask``)
@@ -114,8 +139,9 @@ def delta_lobe(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, ray_ne
     sample, weight = bsdf.sample(context, si, choice, sample2, active)
     transmission = bsdf.eval_null_transmission(si, active)
     d = dr.select(passes, ray.d, dr.select(delta, si.to_world(sample.wo), ray_next.d))
-    change = dr.select(passes, dr.relative_grad(transmission),
-                       dr.select(delta, dr.relative_grad(weight), change))
+    change = dr.select(
+        passes, dr.relative_grad(transmission), dr.select(delta, dr.relative_grad(weight), change)
+    )
     opacity = 1 - channel_mean(mi.unpolarized_spectrum(transmission))
     seen = dr.select(passes, dr.relative_grad(1 - opacity), dr.relative_grad(opacity))
     return d, change, dr.select(active, seen, 1)

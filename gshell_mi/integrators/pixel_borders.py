@@ -68,8 +68,9 @@ class PixelBorders:
         shifted, _ = warp(self.u)
         return dr.dot(self.normal, mi.Vector2f(shifted - self.u)) * self.weight
 
-    def adjoint(self, image_adjoint: list[mi.Float], values: list[mi.Float],
-                control: list[mi.Float]) -> mi.Float:
+    def adjoint(
+        self, image_adjoint: list[mi.Float], values: list[mi.Float], control: list[mi.Float]
+    ) -> mi.Float:
         """Adjoint of the flux. ``values``: the channels on the borders; ``control``: those subtracted
         from the samples inside the pixels, per pixel."""
         total = mi.Float(0)
@@ -80,8 +81,9 @@ class PixelBorders:
                 total += side * dr.gather(mi.Float, g, pixel, inside) * contrast
         return total
 
-    def scatter(self, image: list[mi.Float], flux: mi.Float, values: list[mi.Float],
-                control: list[mi.Float]) -> None:
+    def scatter(
+        self, image: list[mi.Float], flux: mi.Float, values: list[mi.Float], control: list[mi.Float]
+    ) -> None:
         """Adds the tangent that a flux causes to an image."""
         for side in (-1, 1):
             pixel, inside = self._pixel(side)

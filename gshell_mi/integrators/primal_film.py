@@ -16,8 +16,9 @@ from .supported_scenes import sensor_of
 _PACKETS = (1, 2, 4, 8)
 
 
-def render(integrator: ADIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, seed: int,
-           spp: int) -> mi.TensorXf:
+def render(
+    integrator: ADIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int
+) -> mi.TensorXf:
     """The image that ``ADIntegrator.render`` gives."""
     sensor = sensor_of(scene, sensor)
     film, names = sensor.film(), integrator.aov_names()
@@ -26,9 +27,16 @@ def render(integrator: ADIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, s
         ray, weight, position = integrator.sample_rays(scene, sensor, sampler)
         value, valid, aovs, _ = integrator.sample(dr.ADMode.Primal, scene, sampler, ray)
         block = _PaddedBlock(film, spp)
-        ADIntegrator._splat_to_block(block, film, position, value=value * weight, weight=1.0,
-                                     alpha=dr.select(valid, mi.Float(1), mi.Float(0)), aovs=aovs,
-                                     wavelengths=ray.wavelengths)
+        ADIntegrator._splat_to_block(
+            block,
+            film,
+            position,
+            value=value * weight,
+            weight=1.0,
+            alpha=dr.select(valid, mi.Float(1), mi.Float(0)),
+            aovs=aovs,
+            wavelengths=ray.wavelengths,
+        )
         film.put_block(block.without_padding())
         return film.develop()
 
@@ -43,8 +51,9 @@ class _PaddedBlock:
         padded = next((size for size in _PACKETS if size >= self._count), self._count)
         # Merging the additions of a pixel's samples first only pays where they are many, and atomic.
         merge = own.coalesce() and spp >= 4 and dr.backend_v(mi.Float) == dr.JitBackend.CUDA
-        self._block = mi.ImageBlock(film.crop_size(), self._offset, padded, self._filter, self._border,
-                                    coalesce=merge)
+        self._block = mi.ImageBlock(
+            film.crop_size(), self._offset, padded, self._filter, self._border, coalesce=merge
+        )
 
     def channel_count(self) -> int:
         return self._count
@@ -54,5 +63,5 @@ class _PaddedBlock:
         self._block.put(position, [*values, *([mi.Float(0)] * padding)])
 
     def without_padding(self) -> mi.ImageBlock:
-        channels = self._block.tensor()[..., :self._count]
+        channels = self._block.tensor()[..., : self._count]
         return mi.ImageBlock(channels, self._offset, self._filter, self._border)

@@ -22,8 +22,9 @@ from .supported_scenes import check_meshes, check_sensor, sensor_of, warn_once
 from .warp import EdgeGrid, FilmWarp, fixed_line_weight
 
 
-def film_channels(film: mi.Film, value: mi.Spectrum, alpha: mi.Float, aovs: list[mi.Float],
-                  wavelengths: mi.Color0f) -> list[mi.Float]:
+def film_channels(
+    film: mi.Film, value: mi.Spectrum, alpha: mi.Float, aovs: list[mi.Float], wavelengths: mi.Color0f
+) -> list[mi.Float]:
     """The channels that a sample splats, without the weight: colour, alpha if kept, AOVs."""
     value = mi.unpolarized_spectrum(value)
     if mi.is_spectral:
@@ -52,8 +53,9 @@ def _develop(film: mi.Film, channels: list[mi.Float], aov_names: list[str]) -> m
     return film.develop()
 
 
-def _develop_adjoint(film: mi.Film, image_adjoint: mi.TensorXf, count: int,
-                     aov_names: list[str]) -> list[mi.Float]:
+def _develop_adjoint(
+    film: mi.Film, image_adjoint: mi.TensorXf, count: int, aov_names: list[str]
+) -> list[mi.Float]:
     """Adjoint of ``_develop``: per channel the adjoint of each pixel."""
     width, height = film.crop_size()
     with dr.resume_grad():
@@ -72,12 +74,19 @@ def _develop_adjoint(film: mi.Film, image_adjoint: mi.TensorXf, count: int,
 class Warp:
     """The warp T of the film that follows the silhouettes of a scene's meshes."""
 
-    def __init__(self, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor,
-                 samples: CameraSamples, integrator: FilmIntegrator) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        tables: list[tuple[mi.Mesh, EdgeTable]],
+        sensor: mi.Sensor,
+        samples: CameraSamples,
+        integrator: FilmIntegrator,
+    ) -> None:
         self.film, self.radius = sensor.film(), integrator.warp_radius
         margin = self.radius + 2 - samples.origin[0]
-        self.edges = screen_edges(scene, tables, sensor, margin, cull=integrator.cull_hidden,
-                                  crease_angle=integrator.crease_angle)
+        self.edges = screen_edges(
+            scene, tables, sensor, margin, cull=integrator.cull_hidden, crease_angle=integrator.crease_angle
+        )
         self.grid: EdgeGrid | None = None
         if self.edges is None:
             return
@@ -94,8 +103,9 @@ class Warp:
         fixed, grad_fixed = self._fixed_lines(u)
         dr.eval(u, fixed, grad_fixed)
         with dr.resume_grad():
-            velocity, divergence = dr.custom(FilmWarp, self.edges.a, self.edges.b, self.grid, u, fixed,
-                                             grad_fixed)
+            velocity, divergence = dr.custom(
+                FilmWarp, self.edges.a, self.edges.b, self.grid, u, fixed, grad_fixed
+            )
             return u + velocity, 1 + divergence
 
     def is_near(self, u: mi.Point2f) -> mi.Bool:
@@ -113,8 +123,9 @@ class Warp:
         return fixed_line_weight(u, [(k, x) for k in (0, 1) for x in (mi.Float(0), size[k])], self.radius)
 
 
-def _borders(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, warp: Warp, seed: int,
-             spp: int) -> tuple[PixelBorders, list[mi.Float]] | None:
+def _borders(
+    integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, warp: Warp, seed: int, spp: int
+) -> tuple[PixelBorders, list[mi.Float]] | None:
     """For the box filter, samples on pixel borders and their channels; else ``None``."""
     film = sensor.film()
     if not film.rfilter().is_box_filter():
@@ -135,8 +146,9 @@ def _borders(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, war
     return borders, _primal(integrator, scene, sensor, draw, samples)[1]
 
 
-def _prepare(integrator: FilmIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, seed: int,
-             spp: int) -> tuple[mi.Sensor, mi.Sampler, int, CameraSamples]:
+def _prepare(
+    integrator: FilmIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int
+) -> tuple[mi.Sensor, mi.Sampler, int, CameraSamples]:
     sensor = sensor_of(scene, sensor)
     check_sensor(sensor)
     check_meshes(scene)
@@ -147,8 +159,13 @@ def _prepare(integrator: FilmIntegrator, scene: mi.Scene, sensor: int | mi.Senso
     return sensor, sampler, spp, samples
 
 
-def _primal(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler,
-            samples: CameraSamples) -> tuple[PathSample, list[mi.Float]]:
+def _primal(
+    integrator: FilmIntegrator,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    samples: CameraSamples,
+) -> tuple[PathSample, list[mi.Float]]:
     ray, weight = samples.rays(sensor, samples.u)
     state = integrator.primal(scene, sampler.clone(), ray)
     dr.eval(state)
@@ -156,8 +173,14 @@ def _primal(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, samp
     return state, channels
 
 
-def render_backward(integrator: FilmIntegrator, scene: mi.Scene, grad_in: mi.TensorXf,
-                    sensor: int | mi.Sensor, seed: int, spp: int) -> None:
+def render_backward(
+    integrator: FilmIntegrator,
+    scene: mi.Scene,
+    grad_in: mi.TensorXf,
+    sensor: int | mi.Sensor,
+    seed: int,
+    spp: int,
+) -> None:
     """Adds the derivative of ``<grad_in, image>`` to the gradients of the scene's parameters."""
     with dr.suspend_grad():
         sensor, sampler, spp, samples = _prepare(integrator, scene, sensor, seed, spp)
@@ -187,23 +210,37 @@ def render_backward(integrator: FilmIntegrator, scene: mi.Scene, grad_in: mi.Ten
                 return sum(x * d for x, d in zip(channels, on_values, strict=True))
 
             total, state = integrator.attached(dr.ADMode.Backward, scene, sampler, ray, state, on_sample)
-            values = film_channels(film, dr.detach(state.value) * dr.detach(weight), dr.detach(state.alpha),
-                                   dr.detach(state.aovs), ray.wavelengths)
-            dr.schedule(values)     # together with what the traversal evaluates
+            values = film_channels(
+                film,
+                dr.detach(state.value) * dr.detach(weight),
+                dr.detach(state.alpha),
+                dr.detach(state.aovs),
+                ray.wavelengths,
+            )
+            dr.schedule(values)  # together with what the traversal evaluates
             # The edges are passed twice.
             _traverse([*outputs, total], dr.ADFlag.ClearVertices if warp.grid else dr.ADFlag.Default)
             dr.eval(values)
             if warp.grid is not None:
                 values = _in_place(values, index, dr.width(samples.u))
-                outputs = _outputs_of_warp(integrator, scene, sensor, warp, samples, values, image_adjoint,
-                                           seed, spp)
+                outputs = _outputs_of_warp(
+                    integrator, scene, sensor, warp, samples, values, image_adjoint, seed, spp
+                )
                 _traverse(outputs, dr.ADFlag.Default)
         dr.eval()
 
 
-def _outputs_of_warp(integrator: FilmIntegrator, scene: mi.Scene, sensor: mi.Sensor, warp: Warp,
-                     samples: CameraSamples, values: list[mi.Float], image_adjoint: list[mi.Float], seed: int,
-                     spp: int) -> list[mi.Float]:
+def _outputs_of_warp(
+    integrator: FilmIntegrator,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    warp: Warp,
+    samples: CameraSamples,
+    values: list[mi.Float],
+    image_adjoint: list[mi.Float],
+    seed: int,
+    spp: int,
+) -> list[mi.Float]:
     """What the warp does to samples of the given channels, weighted by the image's adjoint."""
     with dr.suspend_grad():
         splat = FilmSplat(sensor.film(), spp, samples.u, values)
@@ -238,8 +275,9 @@ def _traverse(outputs: list[mi.Float], flags: dr.ADFlag) -> None:
     dr.traverse(dr.ADMode.Backward, flags)
 
 
-def render_forward(integrator: FilmIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, seed: int,
-                   spp: int) -> mi.TensorXf:
+def render_forward(
+    integrator: FilmIntegrator, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int
+) -> mi.TensorXf:
     """The derivative of the image along the tangents set on the scene's parameters."""
     with dr.suspend_grad():
         sensor, sampler, spp, samples = _prepare(integrator, scene, sensor, seed, spp)
@@ -261,11 +299,13 @@ def render_forward(integrator: FilmIntegrator, scene: mi.Scene, sensor: int | mi
                 return film_channels(film, value * weight, alpha, aovs, ray.wavelengths)
 
             tangents, (shift, divergence, *swept) = integrator.attached(
-                dr.ADMode.Forward, scene, sampler, ray, state, on_sample, (shifted, det, *swept))
+                dr.ADMode.Forward, scene, sampler, ray, state, on_sample, (shifted, det, *swept)
+            )
         dr.eval(tangents, shift, divergence, swept)
         count = dr.width(samples.u)
         values, tangents, shift, [divergence] = (
-            _in_place(part, index, count) for part in (values, tangents, [*shift], [divergence]))
+            _in_place(part, index, count) for part in (values, tangents, [*shift], [divergence])
+        )
         splat = FilmSplat(film, spp, samples.u, values)
         image = splat.tangent(tangents, mi.Vector2f(*shift), divergence)
         if borders is not None:

@@ -45,8 +45,9 @@ def expand(count: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, int]:
     return entry, number, total
 
 
-def systematic_counts(importance: mi.Float, samples: int,
-                      offset: mi.Float) -> tuple[mi.UInt32, mi.Float] | None:
+def systematic_counts(
+    importance: mi.Float, samples: int, offset: mi.Float
+) -> tuple[mi.UInt32, mi.Float] | None:
     """How often to draw each item, in proportion to its importance, with one uniform number for all.
 
     Args:

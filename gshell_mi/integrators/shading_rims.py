@@ -30,8 +30,9 @@ def shading_rims(mesh: mi.Mesh, viewpoint: mi.Point3f) -> tuple[mi.Point3f, mi.P
         return None
     faces = mesh.faces_buffer()
     with dr.suspend_grad():
-        corner = [dr.gather(mi.UInt32, faces, 3 * dr.arange(mi.UInt32, dr.width(faces) // 3) + k)
-                  for k in range(3)]
+        corner = [
+            dr.gather(mi.UInt32, faces, 3 * dr.arange(mi.UInt32, dr.width(faces) // 3) + k) for k in range(3)
+        ]
         side = [dr.dot(n, viewpoint - p) > 0 for p, n in (_vertex(mesh, c) for c in corner)]
         mixed = (side[0] != side[1]) | (side[1] != side[2])
         # The corner whose side differs from that of the other two
@@ -47,8 +48,10 @@ def shading_rims(mesh: mi.Mesh, viewpoint: mi.Point3f) -> tuple[mi.Point3f, mi.P
 
 
 def _vertex(mesh: mi.Mesh, index: mi.UInt32) -> tuple[mi.Point3f, mi.Vector3f]:
-    return (dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), index),
-            mi.Vector3f(dr.gather(mi.Normal3f, mesh.vertex_normals_buffer(), index)))
+    return (
+        dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), index),
+        mi.Vector3f(dr.gather(mi.Normal3f, mesh.vertex_normals_buffer(), index)),
+    )
 
 
 def _crossing(mesh: mi.Mesh, i: mi.UInt32, j: mi.UInt32, viewpoint: mi.Point3f) -> mi.Point3f:

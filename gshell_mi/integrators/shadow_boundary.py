@@ -47,7 +47,7 @@ _INDIRECT = 0.2
 class BoundaryTerm:
     """Points on curves of the film at which the integrand jumps."""
 
-    moving: mi.Point2f    #: attached: position in pixels relative to the crop window
+    moving: mi.Point2f  #: attached: position in pixels relative to the crop window
     tangent: mi.Vector2f  #: its derivative along the edge
     weight: mi.Float
     jump: list[mi.Float]  #: per film channel, the value on the left of the tangent less the other
@@ -64,8 +64,13 @@ class BoundaryTerm:
         return self.weight * (self.tangent.y * motion.x - self.tangent.x * motion.y)
 
 
-def boundary_terms(integrator: GShellPathIntegrator, scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]],
-                   sensor: mi.Sensor, seed: int) -> Iterator[BoundaryTerm]:
+def boundary_terms(
+    integrator: GShellPathIntegrator,
+    scene: mi.Scene,
+    tables: list[tuple[mi.Mesh, EdgeTable]],
+    sensor: mi.Sensor,
+    seed: int,
+) -> Iterator[BoundaryTerm]:
     """Yields the ``BoundaryTerm`` of each kind of light, and of each depth it is seen at.
 
     ``integrator``: a ``gshell_path``; its ``reparam_depth``, ``gradient_depth``, ``light_edge_samples`` and
@@ -86,8 +91,10 @@ def boundary_terms(integrator: GShellPathIntegrator, scene: mi.Scene, tables: li
 
     draws = []
     if scene.environment() is not None or integrator.gradient_depth > 2:
-        draws += [draw_directions(scene, wedges, samples * CANDIDATES, shifts()),
-                  draw_map_directions(scene, wedges, samples * CANDIDATES, shifts())]
+        draws += [
+            draw_directions(scene, wedges, samples * CANDIDATES, shifts()),
+            draw_map_directions(scene, wedges, samples * CANDIDATES, shifts()),
+        ]
     draws += draw_emitters(scene, wedges, samples * CANDIDATES, shifts())
     boundary = _Boundary(integrator, scene, sensor, wedges)
     for drawn in draws:
@@ -102,15 +109,17 @@ def boundary_terms(integrator: GShellPathIntegrator, scene: mi.Scene, tables: li
 class _Boundary:
     """Follows edge points to the film and measures the jump there."""
 
-    def __init__(self, integrator: GShellPathIntegrator, scene: mi.Scene, sensor: mi.Sensor,
-                 wedges: EdgeWedges) -> None:
+    def __init__(
+        self, integrator: GShellPathIntegrator, scene: mi.Scene, sensor: mi.Sensor, wedges: EdgeWedges
+    ) -> None:
         self.integrator, self.scene, self.sensor, self.wedges = integrator, scene, sensor, wedges
         self.curves = ShadowCurves(scene, sensor, wedges)
         film = sensor.film()
         self.border = film.rfilter().border_size() if film.sample_border() else 0
 
-    def term(self, drawn: ShadowSamples, bounce: int, samples: int,
-             sampler: mi.Sampler) -> BoundaryTerm | None:
+    def term(
+        self, drawn: ShadowSamples, bounce: int, samples: int, sampler: mi.Sampler
+    ) -> BoundaryTerm | None:
         """The boundary term of drawn edge samples, or ``None`` if none of them is seen or nothing moves."""
         indirect = drawn.emitter is None and not bounce and self.integrator.gradient_depth > 2
         cast, outward, importance = self._importance(drawn, bounce, indirect)
@@ -128,14 +137,16 @@ class _Boundary:
         with dr.resume_grad():
             followed = self.curves.follow(self.wedges.positions, drawn, cast, outward, bounce)
             moving = project_to_film(self.sensor, followed.visible)
-            if not dr.grad_enabled(moving):    # as where only materials and lights are sought
+            if not dr.grad_enabled(moving):  # as where only materials and lights are sought
                 return None
         tangent, _, side = self.curves.film_vectors(followed)
         scattered, radiance, ok = self._reflected(drawn, cast, followed, bounce)
         lit, dark = self.curves.rays(drawn, cast, followed, outward)
         if indirect:
-            lit, dark = (self.integrator.primal(self.scene, self._path_sampler(sampler, drawn), ray, ok,
-                                                start=1).value for ray in (lit, dark))
+            lit, dark = (
+                self.integrator.primal(self.scene, self._path_sampler(sampler, drawn), ray, ok, start=1).value
+                for ray in (lit, dark)
+            )
             difference = lit - dark
         else:
             reaches = self._reaches(drawn, lit, followed.lit) & ~self._reaches(drawn, dark, followed.lit)
@@ -150,8 +161,9 @@ class _Boundary:
         result.seed(dr.opaque(mi.UInt32, int(sampler.next_1d()[0] * 2**24)), dr.width(drawn.t))
         return result
 
-    def _importance(self, drawn: ShadowSamples, bounce: int,
-                    indirect: bool) -> tuple[mi.Bool, mi.Vector3f, mi.Float]:
+    def _importance(
+        self, drawn: ShadowSamples, bounce: int, indirect: bool
+    ) -> tuple[mi.Bool, mi.Vector3f, mi.Float]:
         """Which points are those of cast shadows, the way out of each edge's wedge, and how many to use."""
         cast, outward, valid = self.curves.place(drawn)
         followed = self.curves.follow(dr.detach(self.wedges.positions), drawn, cast, outward, bounce)
@@ -172,23 +184,26 @@ class _Boundary:
         dr.eval(cast, outward, importance, drawn.weight)
         return cast, outward, importance
 
-    def _reflected(self, drawn: ShadowSamples, cast: mi.Bool, followed: ShadowPoints,
-                   bounce: int) -> tuple[mi.Spectrum, mi.Spectrum, mi.Bool]:
+    def _reflected(
+        self, drawn: ShadowSamples, cast: mi.Bool, followed: ShadowPoints, bounce: int
+    ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Bool]:
         """What the camera sees per light at the boundary; the emitter's light; whether it is seen at all."""
         film = self.sensor.film()
         visible, tolerance = dr.detach(followed.visible), 1e-3
-        if not bounce:    # on the face that the light reaches
+        if not bounce:  # on the face that the light reaches
             visible = dr.select(cast, visible, visible + 1e-3 * dr.norm(followed.along) * followed.across)
         u = project_to_film(self.sensor, visible) / mi.Vector2f(film.crop_size())
         ray, throughput = self.sensor.sample_ray(self.sensor.shutter_open(), 0.0, u, mi.Point2f(0.5))
         si = self.integrator.first_hit(self.scene, ray, followed.valid).compute_surface_interaction(
-            ray, mi.RayFlags.All, followed.valid)
+            ray, mi.RayFlags.All, followed.valid
+        )
         ok = followed.valid & si.is_valid() & (dr.norm(si.p - visible) < tolerance * si.t)
         context = mi.BSDFContext()
         if bounce:
             throughput = throughput * si.bsdf().eval(context, si, si.to_local(followed.via), ok)
-            target = dr.select(cast, followed.lit, followed.lit + 1e-2 * dr.norm(followed.along) *
-                               followed.across)
+            target = dr.select(
+                cast, followed.lit, followed.lit + 1e-2 * dr.norm(followed.along) * followed.across
+            )
             d = dr.normalize(target - si.p)
             si = self.scene.ray_intersect(si.spawn_ray(d), ok)
             ok &= si.is_valid() & (dr.norm(si.p - target) < tolerance * si.t)
@@ -197,8 +212,9 @@ class _Boundary:
         scattered = throughput * si.bsdf().eval(context, si, si.to_local(direction), ok)
         return scattered, radiance, ok
 
-    def _light(self, drawn: ShadowSamples, si: mi.SurfaceInteraction3f,
-               active: mi.Bool) -> tuple[mi.Vector3f, mi.Spectrum]:
+    def _light(
+        self, drawn: ShadowSamples, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Spectrum]:
         """Direction and radiance (times the geometry term, for points) of unoccluded light."""
         direction = drawn.towards(si.p)
         if drawn.emitter is None:

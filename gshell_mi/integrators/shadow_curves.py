@@ -28,9 +28,9 @@ class ShadowPoints:
     """Shadows of points on edges, or edge points at which a mesh turns away from the light."""
 
     visible: mi.Point3f  #: attached: what a camera may see
-    lit: mi.Point3f      #: where the light arrives
-    y: mi.Point3f        #: the point beside the edge
-    along: mi.Vector3f   #: derivative of ``visible`` along the edge
+    lit: mi.Point3f  #: where the light arrives
+    y: mi.Point3f  #: the point beside the edge
+    along: mi.Vector3f  #: derivative of ``visible`` along the edge
     across: mi.Vector3f  #: derivative of ``visible`` for a unit motion towards the light
     valid: mi.Bool
     via: mi.Vector3f | None  #: direction from ``visible`` to ``lit`` if these differ
@@ -56,8 +56,10 @@ class ShadowCurves:
         normals do so elsewhere, so the light jumps at the edge. Not so where the film warp follows it.
         """
         p, q, axis, inward, across = self.wedges.frame(drawn.edge)
-        low, high = dr.gather(mi.Float, self.wedges.low, drawn.edge), dr.gather(mi.Float, self.wedges.high,
-                                                                                drawn.edge)
+        low, high = (
+            dr.gather(mi.Float, self.wedges.low, drawn.edge),
+            dr.gather(mi.Float, self.wedges.high, drawn.edge),
+        )
         y = dr.lerp(p, q, drawn.t)
         towards = drawn.towards(y)
         middle = 0.5 * (low + high)
@@ -71,12 +73,15 @@ class ShadowCurves:
         valid = dr.isfinite(dr.squared_norm(outward)) & (drawn.weight > 0)
         return cast, mi.Vector3f(outward * (_BESIDE * _scale(y))), valid
 
-    def follow(self, positions: mi.Float, drawn: ShadowSamples, cast: mi.Bool, outward: mi.Vector3f,
-               bounce: int) -> ShadowPoints:
+    def follow(
+        self, positions: mi.Float, drawn: ShadowSamples, cast: mi.Bool, outward: mi.Vector3f, bounce: int
+    ) -> ShadowPoints:
         """From points on edges to what a camera may see of their shadow."""
         wedges = self.wedges
-        a, b = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, x, drawn.edge))
-                for x in (wedges.start, wedges.end))
+        a, b = (
+            dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, x, drawn.edge))
+            for x in (wedges.start, wedges.end)
+        )
         y = mi.Point3f(dr.lerp(a, b, drawn.t)) + outward
         towards = drawn.towards(y)
         shadow, normal, valid = self._next_surface(y, -towards, 0, cast)
@@ -115,8 +120,9 @@ class ShadowCurves:
         length = dr.rcp(dr.maximum(dr.sin(0.5 * (high - low)), _SHARPEST))
         return (inward * dr.cos(middle) + across * dr.sin(middle)) * length
 
-    def _next_surface(self, p: mi.Point3f, direction: mi.Vector3f, lift: mi.Float | float,
-                      active: mi.Bool) -> tuple[mi.Point3f, mi.Normal3f, mi.Bool]:
+    def _next_surface(
+        self, p: mi.Point3f, direction: mi.Vector3f, lift: mi.Float | float, active: mi.Bool
+    ) -> tuple[mi.Point3f, mi.Normal3f, mi.Bool]:
         """The next surface from points along a direction: position, attached; normal; whether any."""
         ray = mi.Ray3f(mi.Point3f(p + direction * lift), direction)
         with dr.suspend_grad():
@@ -143,13 +149,17 @@ class ShadowCurves:
         offset = project_to_film(self.sensor, moved) - project_to_film(self.sensor, p)
         return mi.Vector2f(offset) * (scale / step)
 
-    def rays(self, drawn: ShadowSamples, cast: mi.Bool, followed: ShadowPoints,
-             outward: mi.Vector3f) -> tuple[mi.Ray3f, mi.Ray3f]:
+    def rays(
+        self, drawn: ShadowSamples, cast: mi.Bool, followed: ShadowPoints, outward: mi.Vector3f
+    ) -> tuple[mi.Ray3f, mi.Ray3f]:
         """Rays towards the light that pass by the edge, and that its wedge stops."""
         lit = mi.Ray3f(followed.y, drawn.towards(followed.y))
         # Straight in from a sharp edge would be out again on the other side.
-        into = dr.select(cast, -dr.normalize(outward) * dr.maximum(_scale(followed.lit), _scale(followed.y)),
-                         self._into(drawn.edge) * _scale(followed.y))
+        into = dr.select(
+            cast,
+            -dr.normalize(outward) * dr.maximum(_scale(followed.lit), _scale(followed.y)),
+            self._into(drawn.edge) * _scale(followed.y),
+        )
         inside = followed.y - outward + _INSIDE * into
         origin = dr.select(cast, followed.lit, inside)
         direction = dr.select(cast, dr.normalize(inside - followed.lit), drawn.towards(inside))

@@ -30,16 +30,16 @@ _PEAK = 8.0
 class ShadowSamples:
     """Points on edges and light that the edges may cut off."""
 
-    edge: mi.UInt32                    #: index into the ``EdgeWedges``
-    t: mi.Float                        #: where on the edge
-    weight: mi.Float                   #: one over the expected number of such samples
-    position: mi.Vector3f              #: unit direction of the light, or point on an emitter
-    normal: mi.Normal3f | None         #: the emitter's there, if it has any
-    uv: mi.Point2f | None              #: its texture coordinates there
-    kind: mi.Float                     #: uniform random number
-    via: mi.Point2f                    #: uniform random numbers
+    edge: mi.UInt32  #: index into the ``EdgeWedges``
+    t: mi.Float  #: where on the edge
+    weight: mi.Float  #: one over the expected number of such samples
+    position: mi.Vector3f  #: unit direction of the light, or point on an emitter
+    normal: mi.Normal3f | None  #: the emitter's there, if it has any
+    uv: mi.Point2f | None  #: its texture coordinates there
+    kind: mi.Float  #: uniform random number
+    via: mi.Point2f  #: uniform random numbers
     emitter: mi.Emitter | None = None  #: the emitter; ``None`` for the environment
-    is_point: bool = False             #: whether ``position`` is a point
+    is_point: bool = False  #: whether ``position`` is a point
 
     def take(self, index: mi.UInt32) -> ShadowSamples:
         """The samples with the given indices."""
@@ -55,8 +55,9 @@ class ShadowSamples:
         return dr.normalize(mi.Point3f(self.position) - y) if self.is_point else self.position
 
 
-def draw_directions(scene: mi.Scene, wedges: EdgeWedges, samples: int,
-                    shifts: mi.Float) -> ShadowSamples | None:
+def draw_directions(
+    scene: mi.Scene, wedges: EdgeWedges, samples: int, shifts: mi.Float
+) -> ShadowSamples | None:
     """Edges by length and width of their lunes, directions from the lunes.
 
     Half of the samples are spread evenly over the meshes, lest the rim of a large floor gets all.
@@ -83,8 +84,16 @@ def draw_directions(scene: mi.Scene, wedges: EdgeWedges, samples: int,
     angle = high + opening * (twice - dr.floor(twice)) + dr.select(twice >= 1, dr.pi, 0)
     direction = axis * cosine + (inward * dr.cos(angle) + across * dr.sin(angle)) * sine
     weight *= dr.select(sine > 1e-4, dr.pi * opening / sine, 0)
-    result = ShadowSamples(edge, u[0], weight * (1 - _map_share(scene, direction)), direction,
-                           None, None, u[4], mi.Point2f(u[5], u[6]))
+    result = ShadowSamples(
+        edge,
+        u[0],
+        weight * (1 - _map_share(scene, direction)),
+        direction,
+        None,
+        None,
+        u[4],
+        mi.Point2f(u[5], u[6]),
+    )
     dr.eval(result.arrays())
     return result
 
@@ -105,8 +114,9 @@ def _points(shifts: mi.Float) -> mi.Point2f:
     return mi.Point2f(low_discrepancy(index, 0, shifts), low_discrepancy(index, 1, shifts))
 
 
-def draw_map_directions(scene: mi.Scene, wedges: EdgeWedges, samples: int,
-                        shifts: mi.Float) -> ShadowSamples | None:
+def draw_map_directions(
+    scene: mi.Scene, wedges: EdgeWedges, samples: int, shifts: mi.Float
+) -> ShadowSamples | None:
     """Directions from an environment map's own density, where it is much brighter than elsewhere."""
     environment = scene.environment()
     if environment is None:
@@ -120,26 +130,51 @@ def draw_map_directions(scene: mi.Scene, wedges: EdgeWedges, samples: int,
     return _draw_batch(wedges, mi.Vector3f(ds.d), share / (BATCH * ds.pdf), samples, shifts)
 
 
-def draw_emitters(scene: mi.Scene, wedges: EdgeWedges, samples: int,
-                  shifts: mi.Float) -> Iterator[ShadowSamples | None]:
+def draw_emitters(
+    scene: mi.Scene, wedges: EdgeWedges, samples: int, shifts: mi.Float
+) -> Iterator[ShadowSamples | None]:
     """For each other light points on it (or its direction), and edges that are silhouettes for them."""
     nowhere = dr.zeros(mi.Interaction3f, BATCH)
     for shape in scene.shapes():
         if shape.emitter() is not None:
             ps = shape.sample_position(0.0, _points(shifts))
-            yield _draw_batch(wedges, mi.Vector3f(ps.p), dr.rcp(BATCH * ps.pdf), samples, shifts,
-                              shape.emitter(), True, ps.n, ps.uv)
+            yield _draw_batch(
+                wedges,
+                mi.Vector3f(ps.p),
+                dr.rcp(BATCH * ps.pdf),
+                samples,
+                shifts,
+                shape.emitter(),
+                True,
+                ps.n,
+                ps.uv,
+            )
     for emitter in scene.emitters():
         is_point = mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition)
         if is_point or mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection):
             ds, _ = emitter.sample_direction(nowhere, _points(shifts))
-            yield _draw_batch(wedges, mi.Vector3f(ds.p if is_point else ds.d), mi.Float(1 / BATCH), samples,
-                              shifts, emitter, is_point)
+            yield _draw_batch(
+                wedges,
+                mi.Vector3f(ds.p if is_point else ds.d),
+                mi.Float(1 / BATCH),
+                samples,
+                shifts,
+                emitter,
+                is_point,
+            )
 
 
-def _draw_batch(wedges: EdgeWedges, position: mi.Vector3f, weight: mi.Float, samples: int, shifts: mi.Float,
-                emitter: mi.Emitter | None = None, is_point: bool = False, normal: mi.Normal3f | None = None,
-                uv: mi.Point2f | None = None) -> ShadowSamples | None:
+def _draw_batch(
+    wedges: EdgeWedges,
+    position: mi.Vector3f,
+    weight: mi.Float,
+    samples: int,
+    shifts: mi.Float,
+    emitter: mi.Emitter | None = None,
+    is_point: bool = False,
+    normal: mi.Normal3f | None = None,
+    uv: mi.Point2f | None = None,
+) -> ShadowSamples | None:
     position, weight = (x + dr.zeros(type(x), BATCH) for x in (position, weight))
     dr.make_opaque(position, weight, normal, uv)
     edge = dr.arange(mi.UInt32, dr.width(wedges.start))
@@ -158,7 +193,7 @@ def _draw_batch(wedges: EdgeWedges, position: mi.Vector3f, weight: mi.Float, sam
     edge, number, total = expand(dr.popcnt(bits))
     if total == 0:
         return None
-    word = dr.gather(mi.UInt32, bits, edge)     # find its number-th set bit
+    word = dr.gather(mi.UInt32, bits, edge)  # find its number-th set bit
     source = mi.UInt32(0)
     for j in range(BATCH):
         is_set = (word >> j) & 1
@@ -179,13 +214,17 @@ def _draw_batch(wedges: EdgeWedges, position: mi.Vector3f, weight: mi.Float, sam
     chosen, _, _ = expand(count)
     index = dr.arange(mi.UInt32, dr.width(chosen))
     source = dr.gather(mi.UInt32, source, chosen)
-    result = ShadowSamples(dr.gather(mi.UInt32, edge, chosen), low_discrepancy(index, 2, shifts),
-                           dr.gather(mi.Float, of_source * one_over_expected, chosen),
-                           dr.gather(mi.Vector3f, flat, source),
-                           None if normal is None else dr.gather(mi.Normal3f, normal, source),
-                           None if uv is None else dr.gather(mi.Point2f, uv, source),
-                           low_discrepancy(index, 4, shifts),
-                           mi.Point2f(low_discrepancy(index, 5, shifts), low_discrepancy(index, 6, shifts)),
-                           emitter, is_point)
+    result = ShadowSamples(
+        dr.gather(mi.UInt32, edge, chosen),
+        low_discrepancy(index, 2, shifts),
+        dr.gather(mi.Float, of_source * one_over_expected, chosen),
+        dr.gather(mi.Vector3f, flat, source),
+        None if normal is None else dr.gather(mi.Normal3f, normal, source),
+        None if uv is None else dr.gather(mi.Point2f, uv, source),
+        low_discrepancy(index, 4, shifts),
+        mi.Point2f(low_discrepancy(index, 5, shifts), low_discrepancy(index, 6, shifts)),
+        emitter,
+        is_point,
+    )
     dr.eval(result.arrays())
     return result

@@ -24,8 +24,9 @@ class ScreenEdges:
     b: mi.Point2f  #: attached: second end point
 
 
-def silhouette_mask(positions: mi.Float, faces: mi.UInt32, table: EdgeTable,
-                    viewpoint: mi.Point3f) -> mi.Bool:
+def silhouette_mask(
+    positions: mi.Float, faces: mi.UInt32, table: EdgeTable, viewpoint: mi.Point3f
+) -> mi.Bool:
     """Which directed edges carry the silhouette seen from a point.
 
     An edge carries it when all its faces lie on one side of the plane through the edge and the
@@ -47,8 +48,10 @@ def silhouette_mask(positions: mi.Float, faces: mi.UInt32, table: EdgeTable,
     n = dr.width(faces)
     positions = dr.detach(positions)
     face = dr.arange(mi.UInt32, n) // 3
-    corners = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k)) - viewpoint
-               for k in range(3)]
+    corners = [
+        dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k)) - viewpoint
+        for k in range(3)
+    ]
     towards = dr.dot(corners[0], dr.cross(corners[1], corners[2])) < 0
     side = dr.select(towards == table.forward, mi.Int32(1), mi.Int32(-1))
     sides = dr.zeros(mi.Int32, n)
@@ -67,10 +70,11 @@ def crease_mask(mesh: mi.Mesh, table: EdgeTable, angle: float) -> mi.Bool:
     positions, faces = dr.detach(mesh.vertex_positions_buffer()), mesh.faces_buffer()
     n = dr.width(faces)
     face = dr.arange(mi.UInt32, n) // 3
-    p0, p1, p2 = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k))
-                  for k in range(3))
+    p0, p1, p2 = (
+        dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k)) for k in range(3)
+    )
     normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
-    normal = dr.select(table.forward, normal, -normal)    # differ in sign where orientation agrees
+    normal = dr.select(table.forward, normal, -normal)  # differ in sign where orientation agrees
     total = dr.zeros(mi.Vector3f, n)
     for k in range(3):
         dr.scatter_add(total[k], normal[k], table.edge, table.valid, mode=SIZE_INDEPENDENT)
@@ -93,9 +97,16 @@ def _compact(selected: mi.Bool, *arrays: AnyArray) -> list[AnyArray]:
     return [dr.gather(type(x), x, index) for x in arrays]
 
 
-def _mesh_pieces(mesh: mi.Mesh, table: EdgeTable, sensor: mi.Sensor, crease_angle: float, margin: float,
-                 piece_length: float, to_camera: mi.Transform4f,
-                 near: float) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float] | None:
+def _mesh_pieces(
+    mesh: mi.Mesh,
+    table: EdgeTable,
+    sensor: mi.Sensor,
+    crease_angle: float,
+    margin: float,
+    piece_length: float,
+    to_camera: mi.Transform4f,
+    near: float,
+) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float] | None:
     """The silhouette of one mesh in pieces: vertices of the edge, and the interval of it they span."""
     positions, faces = dr.detach(mesh.vertex_positions_buffer()), mesh.faces_buffer()
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
@@ -128,11 +139,12 @@ def _mesh_pieces(mesh: mi.Mesh, table: EdgeTable, sensor: mi.Sensor, crease_angl
     number = mi.Float(number)
     step = dr.rcp(mi.Float(dr.gather(mi.UInt32, count, edge)))
     start, end, s0, s1, t0, t1, zp, zq = (
-        dr.gather(type(x), x, edge) for x in (start, end, s0, s1, t0, t1, zp, zq))
+        dr.gather(type(x), x, edge) for x in (start, end, s0, s1, t0, t1, zp, zq)
+    )
 
     def along(x: mi.Float) -> mi.Float:
         t = dr.lerp(t0, t1, x)
-        s = t * zp / dr.fma(t, zp, (1 - t) * zq)    # film to edge parameter, perspective-correct
+        s = t * zp / dr.fma(t, zp, (1 - t) * zq)  # film to edge parameter, perspective-correct
         return dr.lerp(s0, s1, s)
 
     return start, end, along(number * step), along((number + 1) * step)
@@ -157,8 +169,16 @@ def _seen(scene: mi.Scene, viewpoint: mi.Point3f, p: mi.Point3f, q: mi.Point3f) 
     return seen
 
 
-def _visible_pieces(scene: mi.Scene, sensor: mi.Sensor, mesh: mi.Mesh, start: mi.UInt32, end: mi.UInt32,
-                    lo: mi.Float, hi: mi.Float, cull: bool) -> tuple[mi.Point2f, mi.Point2f] | None:
+def _visible_pieces(
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    mesh: mi.Mesh,
+    start: mi.UInt32,
+    end: mi.UInt32,
+    lo: mi.Float,
+    hi: mi.Float,
+    cull: bool,
+) -> tuple[mi.Point2f, mi.Point2f] | None:
     """Projected pieces of a mesh's edges, attached, without hidden ones; ``None`` if there are none."""
     if cull:
         viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
@@ -176,8 +196,16 @@ def _visible_pieces(scene: mi.Scene, sensor: mi.Sensor, mesh: mi.Mesh, start: mi
         return project_to_film(sensor, dr.lerp(p, q, lo)), project_to_film(sensor, dr.lerp(p, q, hi))
 
 
-def _visible_rims(scene: mi.Scene, sensor: mi.Sensor, a: mi.Point3f, b: mi.Point3f, margin: float,
-                  to_camera: mi.Transform4f, near: float, cull: bool) -> tuple[mi.Point2f, ...] | None:
+def _visible_rims(
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    a: mi.Point3f,
+    b: mi.Point3f,
+    margin: float,
+    to_camera: mi.Transform4f,
+    near: float,
+    cull: bool,
+) -> tuple[mi.Point2f, ...] | None:
     """The same of chords in world space, which are short enough not to be cut."""
     viewpoint = mi.Point3f(dr.detach(sensor.world_transform()).translation())
     p, q = mi.Point3f(dr.detach(a)), mi.Point3f(dr.detach(b))
@@ -192,13 +220,22 @@ def _visible_rims(scene: mi.Scene, sensor: mi.Sensor, a: mi.Point3f, b: mi.Point
     if dr.width(index) == 0:
         return None
     with dr.resume_grad():
-        return tuple(project_to_film(sensor, dr.gather(mi.Point3f, points, index, mode=SIZE_INDEPENDENT))
-                     for points in (a, b))
+        return tuple(
+            project_to_film(sensor, dr.gather(mi.Point3f, points, index, mode=SIZE_INDEPENDENT))
+            for points in (a, b)
+        )
 
 
-def screen_edges(scene: mi.Scene, tables: list[tuple[mi.Mesh, EdgeTable]], sensor: mi.Sensor, margin: float,
-                 *, piece_length: float = 4.0, cull: bool = True,
-                 crease_angle: float = 0.1) -> ScreenEdges | None:
+def screen_edges(
+    scene: mi.Scene,
+    tables: list[tuple[mi.Mesh, EdgeTable]],
+    sensor: mi.Sensor,
+    margin: float,
+    *,
+    piece_length: float = 4.0,
+    cull: bool = True,
+    crease_angle: float = 0.1,
+) -> ScreenEdges | None:
     """All silhouettes and shading rims of the scene's meshes, projected and cut into short pieces.
 
     Args:

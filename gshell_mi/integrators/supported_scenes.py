@@ -16,8 +16,9 @@ def has_surface_emitters(scene: mi.Scene) -> bool:
 
 def has_bsdf_flag(scene: mi.Scene, flag: mi.BSDFFlags) -> bool:
     """Whether any surface has a BSDF with the given ``BSDFFlags``."""
-    return any(shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), flag)
-               for shape in scene.shapes())
+    return any(
+        shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), flag) for shape in scene.shapes()
+    )
 
 
 def sensor_of(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
@@ -28,20 +29,26 @@ def sensor_of(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
 def check_sensor(sensor: mi.Sensor) -> None:
     """Raises for sensors whose silhouettes are not those of one viewpoint, and for special films."""
     if sensor.class_name() != "PerspectiveCamera":
-        raise UserError(f"Sensor '{sensor.id()}' is a {sensor.class_name()}: gshell_path and gshell_mask "
-                        "differentiate 'perspective' sensors only; use one of these, or mi.render() "
-                        "without derivatives.")
+        raise UserError(
+            f"Sensor '{sensor.id()}' is a {sensor.class_name()}: gshell_path and gshell_mask "
+            "differentiate 'perspective' sensors only; use one of these, or mi.render() "
+            "without derivatives."
+        )
     if mi.has_flag(sensor.film().flags(), mi.FilmFlags.Special):
-        raise UserError(f"The film of sensor '{sensor.id()}' has its own sample format, which gshell_path "
-                        "and gshell_mask cannot differentiate; use 'hdrfilm'.")
+        raise UserError(
+            f"The film of sensor '{sensor.id()}' has its own sample format, which gshell_path "
+            "and gshell_mask cannot differentiate; use 'hdrfilm'."
+        )
 
 
 def check_meshes(scene: mi.Scene) -> None:
     """Raises for meshes without faces, from whose empty buffers Mitsuba cannot read."""
     for shape in scene.shapes():
         if shape.is_mesh() and shape.face_count() == 0:
-            raise UserError(f"Mesh '{shape.id()}' has no face, which Mitsuba cannot render; leave it out, or "
-                            "give it a face whose three corners are the same.")
+            raise UserError(
+                f"Mesh '{shape.id()}' has no face, which Mitsuba cannot render; leave it out, or "
+                "give it a face whose three corners are the same."
+            )
 
 
 def unsupported(scene: mi.Scene) -> list[str]:
@@ -54,16 +61,23 @@ def unsupported(scene: mi.Scene) -> list[str]:
     sentences = []
     for shape in scene.shapes():
         if not shape.is_mesh():
-            sentences.append(f"Shape '{shape.id()}' ({shape.class_name()}) is no triangle mesh: its "
-                             "silhouettes have no derivative.")
+            sentences.append(
+                f"Shape '{shape.id()}' ({shape.class_name()}) is no triangle mesh: its "
+                "silhouettes have no derivative."
+            )
         bsdf = shape.bsdf()
-        if bsdf is not None and any(mi.has_flag(bsdf.flags(), flag) for flag in
-                                    (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)):
-            sentences.append(f"Shape '{shape.id()}' is a perfect mirror or glass: silhouettes seen in or "
-                             "through it have no derivative.")
+        if bsdf is not None and any(
+            mi.has_flag(bsdf.flags(), flag)
+            for flag in (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
+        ):
+            sentences.append(
+                f"Shape '{shape.id()}' is a perfect mirror or glass: silhouettes seen in or "
+                "through it have no derivative."
+            )
         elif bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null):
-            sentences.append(f"Shape '{shape.id()}' is partly transparent: shadows seen through it have no "
-                             "derivative.")
+            sentences.append(
+                f"Shape '{shape.id()}' is partly transparent: shadows seen through it have no derivative."
+            )
     return sentences
 
 

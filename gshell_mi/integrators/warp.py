@@ -28,8 +28,9 @@ class EdgeGrid:
         origin, size: integer corner and extent of the rectangle in pixels.
     """
 
-    def __init__(self, a: mi.Point2f, b: mi.Point2f, radius: float, origin: tuple[int, int],
-                 size: tuple[int, int]) -> None:
+    def __init__(
+        self, a: mi.Point2f, b: mi.Point2f, radius: float, origin: tuple[int, int], size: tuple[int, int]
+    ) -> None:
         self.radius = dr.opaque(mi.Float, radius)
         self.origin = mi.Point2i(dr.opaque(mi.Int32, origin[0]), dr.opaque(mi.Int32, origin[1]))
         self.size = mi.Point2i(dr.opaque(mi.Int32, size[0]), dr.opaque(mi.Int32, size[1]))
@@ -49,15 +50,21 @@ class EdgeGrid:
         total = dr.sum(counter)
         dr.eval(self.first, self.last, total)
         self.pieces = dr.zeros(mi.UInt32, max(total[0], 1))
-        cursor = self.first + dr.opaque(mi.UInt32, 0)    # a copy: the loop increments it in place
+        cursor = self.first + dr.opaque(mi.UInt32, 0)  # a copy: the loop increments it in place
         dr.eval(cursor, self.pieces)
         self._visit_cells(a, b, cursor, self.pieces, dr.arange(mi.UInt32, n))
         dr.eval(self.pieces)
 
     @dr.syntax
-    def _visit_cells(self, a: mi.Point2f, b: mi.Point2f, counter: mi.UInt32, pieces: mi.UInt32 | None,
-                     index: mi.UInt32 | None) -> None:
-        reach = self.radius + 0.7072    # half the diagonal of a pixel
+    def _visit_cells(
+        self,
+        a: mi.Point2f,
+        b: mi.Point2f,
+        counter: mi.UInt32,
+        pieces: mi.UInt32 | None,
+        index: mi.UInt32 | None,
+    ) -> None:
+        reach = self.radius + 0.7072  # half the diagonal of a pixel
         low = mi.Point2i(dr.floor(dr.minimum(a, b) - self.radius)) - self.origin
         high = mi.Point2i(dr.floor(dr.maximum(a, b) + self.radius)) - self.origin
         low, high = dr.maximum(low, 0), dr.minimum(high, self.size - 1)
@@ -92,8 +99,9 @@ def nearest_on_segment(u: mi.Point2f, a: mi.Point2f, b: mi.Point2f) -> tuple[mi.
     return t, dr.norm(offset), offset
 
 
-def _weight(grid: EdgeGrid, u: mi.Point2f, piece: mi.UInt32,
-            active: mi.Bool) -> tuple[mi.Float, mi.Vector2f, mi.Float, mi.Vector2f]:
+def _weight(
+    grid: EdgeGrid, u: mi.Point2f, piece: mi.UInt32, active: mi.Bool
+) -> tuple[mi.Float, mi.Vector2f, mi.Float, mi.Vector2f]:
     """Weight, its gradient, segment parameter and its gradient for one piece."""
     ends = dr.gather(mi.Vector4f, grid.ends, piece, active)
     a, b = mi.Point2f(ends.x, ends.y), mi.Point2f(ends.z, ends.w)
@@ -114,8 +122,15 @@ class FilmWarp(dr.CustomOp):
     weight of immovable lines (``Float``) and its gradient (``Vector2f``) at each sample, or zeros.
     """
 
-    def eval(self, a: mi.Point2f, b: mi.Point2f, grid: EdgeGrid, u: mi.Point2f, fixed: mi.Float,
-             grad_fixed: mi.Vector2f) -> tuple[mi.Vector2f, mi.Float]:
+    def eval(
+        self,
+        a: mi.Point2f,
+        b: mi.Point2f,
+        grid: EdgeGrid,
+        u: mi.Point2f,
+        fixed: mi.Float,
+        grad_fixed: mi.Vector2f,
+    ) -> tuple[mi.Vector2f, mi.Float]:
         self.grid, self.u, self.count = grid, u, dr.width(a)
         self.fixed, self.grad_fixed = fixed, grad_fixed
         n = dr.width(u)
@@ -150,8 +165,7 @@ class FilmWarp(dr.CustomOp):
             dr.scatter(tangents, x, index + k, mode=dr.ReduceMode.Permute)
         dr.eval(tangents)
         total, grad_total, moved, spread = self._normaliser(tangents)
-        self.set_grad_out((moved / total,
-                           spread / total - dr.dot(moved, grad_total) / dr.square(total)))
+        self.set_grad_out((moved / total, spread / total - dr.dot(moved, grad_total) / dr.square(total)))
 
     @dr.syntax
     def backward(self) -> None:
@@ -181,8 +195,9 @@ class FilmWarp(dr.CustomOp):
         return "film warp"
 
 
-def fixed_line_weight(u: mi.Point2f, lines: list[tuple[int, mi.Float]],
-                      radius: float) -> tuple[mi.Float, mi.Vector2f]:
+def fixed_line_weight(
+    u: mi.Point2f, lines: list[tuple[int, mi.Float]], radius: float
+) -> tuple[mi.Float, mi.Vector2f]:
     """Weight and gradient for axis-aligned lines that must not move (frame, pixel borders).
 
     ``lines``: list of ``(axis, coordinate)``, the coordinate a ``Float``.

@@ -16,6 +16,19 @@ from .lattice import (
     make_lattice,
 )
 
-__all__ = ["GRIDS", "MISSING", "MOST_CELLS", "BccLattice", "BlockLattice", "CubeLattice", "CubicGrid",
-           "FlexiCubesLattice", "Lattice", "TetLattice", "array_type", "block_count", "lattice_of",
-           "make_lattice"]
+__all__ = [
+    "GRIDS",
+    "MISSING",
+    "MOST_CELLS",
+    "BccLattice",
+    "BlockLattice",
+    "CubeLattice",
+    "CubicGrid",
+    "FlexiCubesLattice",
+    "Lattice",
+    "TetLattice",
+    "array_type",
+    "block_count",
+    "lattice_of",
+    "make_lattice",
+]

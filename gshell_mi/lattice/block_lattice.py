@@ -81,8 +81,10 @@ class BlockLattice:
         """Eight per row: itself and the seven rows above it, numbered like the corners of a cell."""
         lane = dr.arange(uint_t, 3 * dr.width(self._key))
         row = lane // 3
-        at = [dr.gather(uint_t, c, row) - dr.select(lane - 3 * row == i, uint_t(1), 0)
-              for i, c in enumerate((column, y, z))]
+        at = [
+            dr.gather(uint_t, c, row) - dr.select(lane - 3 * row == i, uint_t(1), 0)
+            for i, c in enumerate((column, y, z))
+        ]
         self.lower: UInt32 = rows.find(*at)[0]
         """Three per row: the rows before it along x, y and z."""
         before, here, after = rows.surrounded(column, y, z)
@@ -102,12 +104,14 @@ class BlockLattice:
         dr.eval(self.beyond)
         cells, _ = self.active_cells(values)
         if dr.width(cells) and dr.any(is_set(self.edge, cells))[0]:
-            raise UserError("the surface of sdf runs out of the blocks; BlockLattice.around finds those that "
-                            "it needs")
+            raise UserError(
+                "the surface of sdf runs out of the blocks; BlockLattice.around finds those that it needs"
+            )
 
     @classmethod
-    def around(cls, lattice: Lattice, sdf: Float | Callable[[Array3f], Float],
-               float_t: type[Float] | None = None) -> BlockLattice:
+    def around(
+        cls, lattice: Lattice, sdf: Float | Callable[[Array3f], Float], float_t: type[Float] | None = None
+    ) -> BlockLattice:
         """The blocks around a surface, found by a scan of the whole lattice.
 
         Args:
@@ -116,13 +120,15 @@ class BlockLattice:
             float_t: with a function, the Dr.Jit float type to compute with.
         """
         if not lattice.fits_in_blocks:
-            raise UserError(f"the grid '{lattice.grid}' cannot be stored in blocks; choose another or leave "
-                            f"out the band")
+            raise UserError(
+                f"the grid '{lattice.grid}' cannot be stored in blocks; choose another or leave out the band"
+            )
         if not callable(sdf):
             field = dr.detach(sdf.array if dr.is_tensor_v(sdf) else sdf)
             if dr.width(field) != lattice.vertex_count:
-                raise UserError(f"sdf has {dr.width(field)} values, but the lattice needs "
-                                f"{lattice.vertex_count}")
+                raise UserError(
+                    f"sdf has {dr.width(field)} values, but the lattice needs {lattice.vertex_count}"
+                )
             cells, _ = active_cells(field, lattice)
             return cls(lattice, _blocks_near(lattice, cells), lambda blocks: blocks.take(field))
         assert float_t is not None, "a function needs a type of numbers to compute with"
@@ -218,8 +224,11 @@ class BlockLattice:
     def neighbours(self, vertex: UInt32) -> list[UInt32]:
         """Ids of the nearest stored vertices, as of a lattice: the vertex itself where there is none."""
         mask_t = dr.mask_t(self._uint_t)
-        found = (self.neighbour(vertex, self._uint_t(axis), mask_t(up))
-                 for axis in range(3) for up in (False, True))
+        found = (
+            self.neighbour(vertex, self._uint_t(axis), mask_t(up))
+            for axis in range(3)
+            for up in (False, True)
+        )
         return [dr.select(neighbour == MISSING, vertex, neighbour) for neighbour in found]
 
     def signs(self, sdf: Float) -> UInt32:
@@ -294,8 +303,9 @@ class BlockLattice:
         needed |= dr.select(along + MARGIN + 1 >= 32, self._uint_t(4), 0)
         return not dr.any(dr.gather(self._uint_t, self._lacking, cells >> 5) & needed != 0)[0]
 
-    def around_cells(self, cells: UInt32, sdf: Callable[[BlockLattice], Float], *,
-                     keep: bool = False) -> BlockLattice:
+    def around_cells(
+        self, cells: UInt32, sdf: Callable[[BlockLattice], Float], *, keep: bool = False
+    ) -> BlockLattice:
         """The blocks around cells of this one.
 
         Args:

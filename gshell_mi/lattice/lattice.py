@@ -301,8 +301,10 @@ class BccLattice(Lattice):
         changes = total & 1  # to the other grid, whose numbers are those of half a cell below or above
         rounding = dr.select(second, changes, uint_t(0) - changes)
         # A step along a basis vector is one of half a cell along two axes, and one back along the third.
-        x, y, z = (number + (total + 2 - 2 * bit + rounding >> 1) - 1
-                   for number, bit in zip(self.coordinates(vertex), bits, strict=True))
+        x, y, z = (
+            number + (total + 2 - 2 * bit + rounding >> 1) - 1
+            for number, bit in zip(self.coordinates(vertex), bits, strict=True)
+        )
         exists = (x < stride) & (y < stride) & (z < stride)  # -1 has wrapped around
         found = x + stride * (y + stride * z) + dr.select(second ^ (changes == 1), count, 0)
         return dr.select(exists, found, MISSING)

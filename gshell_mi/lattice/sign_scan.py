@@ -1,6 +1,5 @@
 """One pass over the signs of a whole lattice: the cells in which they change, and what is near."""
 
-
 import drjit as dr
 
 from ..arrays import Float, UInt32
@@ -41,9 +40,12 @@ def sign_changes(inside: UInt32, lattice: Lattice) -> UInt32:
     if isinstance(lattice, BccLattice):
         in_second = ~_bits_before(word, lattice.stride**3)
         for corner in range(1, 8):
-            first, second = (_shifted(inside, word, dr.opaque(uint_t, offset >> 5 & MISSING),
-                                      dr.opaque(uint_t, offset & 31))
-                             for offset in (lattice.corner_offset(corner, grid) for grid in (False, True)))
+            first, second = (
+                _shifted(
+                    inside, word, dr.opaque(uint_t, offset >> 5 & MISSING), dr.opaque(uint_t, offset & 31)
+                )
+                for offset in (lattice.corner_offset(corner, grid) for grid in (False, True))
+            )
             active |= (first & ~in_second | second & in_second) ^ inside
     else:
         for corner in range(1, 8):

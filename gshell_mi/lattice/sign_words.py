@@ -1,6 +1,5 @@
 """Signs of a field, one bit per vertex, in words of 32; and the numbers of the bits that are set."""
 
-
 import drjit as dr
 
 from ..arrays import Bool, Float, UInt32

@@ -60,6 +60,7 @@ def chroma_difference(first: mi.Color3f, second: mi.Color3f, active: mi.Bool | N
     Args:
         active: the entries that count; default all.
     """
+
     def chroma(color: mi.Color3f) -> mi.Color3f:
         return color / dr.maximum(color.x + color.y + color.z, 1e-4)
 

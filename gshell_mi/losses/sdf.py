@@ -56,8 +56,9 @@ def eikonal(sdf: mi.Float, lattice: Lattice | BlockLattice, reach: float = 3.0) 
     return mean_where(near, dr.square(dr.sqrt(dr.maximum(squared_slope, 1e-8)) - 1))
 
 
-def _axis_edges(sdf: mi.Float,
-                lattice: Lattice | BlockLattice) -> Iterator[tuple[mi.Float, mi.Float, mi.Bool]]:
+def _axis_edges(
+    sdf: mi.Float, lattice: Lattice | BlockLattice
+) -> Iterator[tuple[mi.Float, mi.Float, mi.Bool]]:
     """Per axis the values at each vertex and at its next neighbour, and whether that exists."""
     if isinstance(lattice, BlockLattice):
         vertex = dr.arange(mi.UInt32, lattice.vertex_count)

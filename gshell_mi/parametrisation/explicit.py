@@ -34,8 +34,9 @@ class ExplicitGrid(Parametrisation):
 
     is_explicit = True
 
-    def __init__(self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules,
-                 seed: int = 0):
+    def __init__(
+        self, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice, rules: StepRules, seed: int = 0
+    ):
         self.lattice, self.rules = lattice, rules
         self.optimizer = mi.ad.Adam(lr=rules.rate, uniform=True)
         # What a mean over all pixels says of one vertex may be smaller than the epsilon that is usual.
@@ -48,23 +49,35 @@ class ExplicitGrid(Parametrisation):
         return {"geometry": self.optimizer, "msdf": self.msdf_optimizer}
 
     def fields(self) -> dict[str, mi.Float]:
-        return {name: mi.Float(dr.detach(optimizer[name]))
-                for optimizer in self.optimizers.values() for name in optimizer.keys()}
+        return {
+            name: mi.Float(dr.detach(optimizer[name]))
+            for optimizer in self.optimizers.values()
+            for name in optimizer.keys()
+        }
 
     def carry(self, carried: Carried) -> None:
         for optimizer in self.optimizers.values():
             carried.optimizer(optimizer, tuple(optimizer.keys()))
         self.lattice = carried.after
 
-    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
-             diffuse: LatticeDiffusion | None = None) -> None:
+    def step(
+        self,
+        gradients: Mapping[str, mi.Float],
+        progress: float,
+        iteration: int = 0,
+        diffuse: LatticeDiffusion | None = None,
+    ) -> None:
         rules = self.rules
         decay = decay_at(progress)
         smoothing = falling(rules.smoothing, rules.detail, progress)
         diffuse = diffuse or LatticeDiffusion(self.lattice)
         spacing, local = self.lattice.spacing, rules.deform_rate
-        rates = {"sdf": rules.rate * spacing, "msdf": decay * rules.msdf_rate * spacing, "deform": local,
-                 "weights": local}
+        rates = {
+            "sdf": rules.rate * spacing,
+            "msdf": decay * rules.msdf_rate * spacing,
+            "deform": local,
+            "weights": local,
+        }
         steps = {name: trusted(gradient) for name, gradient in gradients.items()}
         steps |= diffuse.together({name: steps[name] for name in steps if name in CHANNELS}, smoothing)
         for name, gradient in steps.items():

@@ -36,8 +36,14 @@ def parametrisation_named(name: str) -> type[Parametrisation]:
     return _KINDS[name]
 
 
-def make_parametrisation(name: str, start: Mapping[str, mi.Float], lattice: Lattice | BlockLattice,
-                         rules: StepRules | None = None, *, seed: int = 0) -> Parametrisation:
+def make_parametrisation(
+    name: str,
+    start: Mapping[str, mi.Float],
+    lattice: Lattice | BlockLattice,
+    rules: StepRules | None = None,
+    *,
+    seed: int = 0,
+) -> Parametrisation:
     """The parametrisation ``name`` of the fields of a lattice.
 
     Args:

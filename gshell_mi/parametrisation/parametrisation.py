@@ -64,8 +64,13 @@ class Parametrisation(ABC):
         """The present fields, detached."""
 
     @abstractmethod
-    def step(self, gradients: Mapping[str, mi.Float], progress: float, iteration: int = 0,
-             diffuse: LatticeDiffusion | None = None) -> None:
+    def step(
+        self,
+        gradients: Mapping[str, mi.Float],
+        progress: float,
+        iteration: int = 0,
+        diffuse: LatticeDiffusion | None = None,
+    ) -> None:
         """Moves the parameters.
 
         Args:

@@ -25,8 +25,13 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return run_command("report", "Write report.html of a fit: one page that needs no network.", _Arguments,
-                       _report, arguments)
+    return run_command(
+        "report",
+        "Write report.html of a fit: one page that needs no network.",
+        _Arguments,
+        _report,
+        arguments,
+    )
 
 
 def _report(given: _Arguments) -> None:

@@ -72,12 +72,16 @@ def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic
     down = lambda y: _TOP + (y_high - y) / y_span * (_HEIGHT - _TOP - _BOTTOM)  # noqa: E731
     legend = _legend(list(points)) if len(points) > 1 else []
     height = _HEIGHT + _ROW * len(legend)
-    parts = [f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escape(title)}">',
-             f'<text x="{_LEFT}" y="14" class="title">{escape(title)}</text>']
+    parts = [
+        f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escape(title)}">',
+        f'<text x="{_LEFT}" y="14" class="title">{escape(title)}</text>',
+    ]
     for y in np.linspace(y_low, y_high, 4):
-        label = f"{10 ** y:.2g}" if logarithmic else f"{y:.3g}"
-        parts.append(f'<path class="grid" d="M{_LEFT} {down(y):.1f}H{_WIDTH - _RIGHT}"/>'
-                     f'<text x="{_LEFT - 6}" y="{down(y) + 4:.1f}" text-anchor="end">{label}</text>')
+        label = f"{10**y:.2g}" if logarithmic else f"{y:.3g}"
+        parts.append(
+            f'<path class="grid" d="M{_LEFT} {down(y):.1f}H{_WIDTH - _RIGHT}"/>'
+            f'<text x="{_LEFT - 6}" y="{down(y) + 4:.1f}" text-anchor="end">{label}</text>'
+        )
     for x in (x_low, x_high):
         parts.append(f'<text x="{across(x):.1f}" y="{_HEIGHT - 8}" text-anchor="middle">{x:.0f}</text>')
     for number, (name, (x, y)) in enumerate(points.items()):
@@ -98,6 +102,8 @@ def _legend(names: list[str]) -> list[str]:
         color = _COLORS[number % len(_COLORS)]
         rows[-1].append(f'<tspan dx="10" fill="{color}">{escape(name.replace("_", " "))}</tspan>')
         used += len(name) + 2
-    return [f'<text x="{_WIDTH / 2}" y="{_HEIGHT - 8 + _ROW * (row + 1)}" text-anchor="middle">'
-            f'{"".join(tspans)}</text>' for row, tspans in enumerate(rows)]
-
+    return [
+        f'<text x="{_WIDTH / 2}" y="{_HEIGHT - 8 + _ROW * (row + 1)}" text-anchor="middle">'
+        f"{''.join(tspans)}</text>"
+        for row, tspans in enumerate(rows)
+    ]

@@ -10,12 +10,18 @@ from ..errors import UserError
 from ..json_files import read_json
 
 #: The entries that a page cannot do without, and what they are.
-_NEEDED = {"scene": str, "psnr_training": float, "training": dict, "counts": dict, "seconds": dict,
-           "versions": dict, "config": dict}
+_NEEDED = {
+    "scene": str,
+    "psnr_training": float,
+    "training": dict,
+    "counts": dict,
+    "seconds": dict,
+    "versions": dict,
+    "config": dict,
+}
 
 #: Those that may be missing.
-_OPTIONAL = {"warnings": list, "diagnostics": dict, "held_out": dict, "exposures": dict,
-             "poses": dict}
+_OPTIONAL = {"warnings": list, "diagnostics": dict, "held_out": dict, "exposures": dict, "poses": dict}
 
 #: Entries within them that a page takes for numbers.
 _NUMBERS = {"counts": ("vertices", "faces", "boundary_loops", "components"), "seconds": ("total",)}
@@ -68,9 +74,12 @@ def _are_scores(entry: dict) -> bool:
     views = entry.get("views")
     if not isinstance(views, dict):
         return False
-    return all(isinstance(scores, dict) and _is_number(scores.get("psnr"))
-               and all(score is None or _is_number(score) for score in scores.values())
-               for scores in (*views.values(), entry.get("mean")))
+    return all(
+        isinstance(scores, dict)
+        and _is_number(scores.get("psnr"))
+        and all(score is None or _is_number(score) for score in scores.values())
+        for scores in (*views.values(), entry.get("mean"))
+    )
 
 
 def _are_corrections(metrics: dict) -> bool:
@@ -80,7 +89,8 @@ def _are_corrections(metrics: dict) -> bool:
         return False
     stops = metrics.get("exposures", {}).get("stops", {})
     return isinstance(stops, dict) and all(
-        _is_number(value) for told in (stops, *views.values()) for value in told.values())
+        _is_number(value) for told in (stops, *views.values()) for value in told.values()
+    )
 
 
 def _is_number(value: object) -> bool:

@@ -37,8 +37,15 @@ from .views import (
 _PROBE_HEIGHT = 160
 
 #: Of the overlays, as CSS writes them.
-_COLORS = {name: "#" + "".join(f"{round(255 * part):02x}" for part in color) for name, color in (
-    ("both", BOTH), ("mask_only", MASK_ONLY), ("fit_only", FIT_ONLY), ("unknown", UNKNOWN))}
+_COLORS = {
+    name: "#" + "".join(f"{round(255 * part):02x}" for part in color)
+    for name, color in (
+        ("both", BOTH),
+        ("mask_only", MASK_ONLY),
+        ("fit_only", FIT_ONLY),
+        ("unknown", UNKNOWN),
+    )
+}
 
 
 @dataclass(frozen=True)
@@ -74,8 +81,14 @@ def write_report(folder: Path, config: ReportConfig | None = None) -> Path:
 
 
 def _write(folder: Path, metrics: dict, config: ReportConfig) -> Path:
-    turntable = TurntableConfig(frames=config.turntable_frames, size=config.turntable_size,
-                                spp=config.turntable_spp, fps=12, max_depth=3, orange_back=True)
+    turntable = TurntableConfig(
+        frames=config.turntable_frames,
+        size=config.turntable_size,
+        spp=config.turntable_spp,
+        fps=12,
+        max_depth=3,
+        orange_back=True,
+    )
     frames = render_turntable(folder, turntable)
     if not (folder / "mesh.glb").is_file():
         write_asset(folder)
@@ -83,21 +96,31 @@ def _write(folder: Path, metrics: dict, config: ReportConfig) -> Path:
         (video,) = write_video(frames, Path(place) / "turntable.mp4", turntable.fps, gif=False)
         video_data = data_url("video/mp4", video.read_bytes())
     page = files("gshell_mi.report") / "page"
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
-                                     lstrip_blocks=True)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     environment.filters["counted"] = counted
     template = environment.from_string((page / "report.html.j2").read_text(encoding="utf-8"))
     library = (page / "model-viewer.min.js").read_text(encoding="utf-8").rpartition("//# sourceMappingURL")[0]
     text = template.render(
-        name=Path(metrics["scene"]).stem, generator=TAG, metrics=metrics, turntable=video_data,
-        model=data_url("model/gltf-binary", viewer_model(folder)), library=Markup(library),
-        headings=HEADINGS, training=training_pictures(folder, config.views, metrics),
-        training_rows=score_rows(metrics["training"]), held_out=held_out_pictures(folder, metrics),
+        name=Path(metrics["scene"]).stem,
+        generator=TAG,
+        metrics=metrics,
+        turntable=video_data,
+        model=data_url("model/gltf-binary", viewer_model(folder)),
+        library=Markup(library),
+        headings=HEADINGS,
+        training=training_pictures(folder, config.views, metrics),
+        training_rows=score_rows(metrics["training"]),
+        held_out=held_out_pictures(folder, metrics),
         held_out_rows=score_rows(metrics["held_out"]) if "held_out" in metrics else [],
-        corrections=correction_rows(metrics), correction_headings=CORRECTION_HEADINGS,
-        masks=mask_pictures(folder, metrics), colors=_COLORS,
+        corrections=correction_rows(metrics),
+        correction_headings=CORRECTION_HEADINGS,
+        masks=mask_pictures(folder, metrics),
+        colors=_COLORS,
         curves=[Markup(drawing) for drawing in curves(folder / "log.jsonl")],
-        probe=image_url(_probe(folder / "light.exr")))
+        probe=image_url(_probe(folder / "light.exr")),
+    )
     with replacing(folder / "report.html") as partial:
         partial.write_text(text, encoding="utf-8")
     return folder / "report.html"
@@ -108,13 +131,23 @@ def _probe(path: Path) -> np.ndarray:
     radiance = read_environment_map(path, "Light")
     light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(radiance)})
     size = _PROBE_HEIGHT
-    sensor = {"type": "perspective", "fov": 30,
-              "to_world": mi.ScalarTransform4f().look_at([0, 0.6, 4], [0, 0, 0], [0, 1, 0]),
-              "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba"}}
+    sensor = {
+        "type": "perspective",
+        "fov": 30,
+        "to_world": mi.ScalarTransform4f().look_at([0, 0.6, 4], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba"},
+    }
     balls = []
     for bsdf in ({"type": "conductor", "material": "none"}, {"type": "diffuse"}):
-        scene = mi.load_dict({"type": "scene", "light": light, "ball": {"type": "sphere", "bsdf": bsdf},
-                              "sensor": sensor, "integrator": {"type": "path", "hide_emitters": True}})
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "light": light,
+                "ball": {"type": "sphere", "bsdf": bsdf},
+                "sensor": sensor,
+                "integrator": {"type": "path", "hide_emitters": True},
+            }
+        )
         balls.append(np.array(mi.render(scene, spp=64)))
     exposure = 0.8 / max(float(np.percentile(radiance, 95)), 1e-6)
     rows = np.arange(size) * len(radiance) // size

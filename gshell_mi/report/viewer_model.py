@@ -35,17 +35,40 @@ def viewer_model(folder: Path) -> bytes:
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
     parts = [back_faces(subject.attributes["POSITION"], subject.attributes["NORMAL"], subject.indices)]
     if len(template.faces):
-        parts.append(Part("template", template.faces,
-                          {"POSITION": template.vertices @ turn.T, "NORMAL": template.normals @ turn.T},
-                          {"pbrMetallicRoughness": {"baseColorFactor": [0.25, 0.4, 0.7, 0],
-                                                    "metallicFactor": 0, "roughnessFactor": 0.6},
-                           "alphaMode": "BLEND"}))
+        parts.append(
+            Part(
+                "template",
+                template.faces,
+                {"POSITION": template.vertices @ turn.T, "NORMAL": template.normals @ turn.T},
+                {
+                    "pbrMetallicRoughness": {
+                        "baseColorFactor": [0.25, 0.4, 0.7, 0],
+                        "metallicFactor": 0,
+                        "roughnessFactor": 0.6,
+                    },
+                    "alphaMode": "BLEND",
+                },
+            )
+        )
     tubes = boundary_tubes(mesh.vertices @ turn.T, mesh.faces, _TUBE_RADIUS * float(diagonal))
     if tubes:
-        parts.append(Part("boundary loops", tubes[1], {"POSITION": tubes[0]},
-                          {"pbrMetallicRoughness": {"baseColorFactor": [0.6, 0, 0.25, 1], "metallicFactor": 0,
-                                                    "roughnessFactor": 1}, "emissiveFactor": [0.5, 0, 0.2],
-                           "alphaMode": "MASK", "doubleSided": True}))
+        parts.append(
+            Part(
+                "boundary loops",
+                tubes[1],
+                {"POSITION": tubes[0]},
+                {
+                    "pbrMetallicRoughness": {
+                        "baseColorFactor": [0.6, 0, 0.25, 1],
+                        "metallicFactor": 0,
+                        "roughnessFactor": 1,
+                    },
+                    "emissiveFactor": [0.5, 0, 0.2],
+                    "alphaMode": "MASK",
+                    "doubleSided": True,
+                },
+            )
+        )
     return glb_bytes(parts, base)
 
 
@@ -58,7 +81,7 @@ def _subject(path: Path) -> tuple[bytes, Part]:
         if normals.shape != subject.attributes["POSITION"].shape:
             raise ValueError("its normals are not as many as its vertices")
         return base, subject
-    except Exception as error:    # anything may be where a number should be
+    except Exception as error:  # anything may be where a number should be
         reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
         raise UserError(f"'{path}' is damaged ({reason}); delete it and make the report again.") from error
 
@@ -67,13 +90,24 @@ def back_faces(positions: np.ndarray, normals: np.ndarray, faces: np.ndarray) ->
     """The other side of a sheet in orange, as the paper shows it."""
     # A hair behind, or the two sides would flicker.
     offset = 3e-4 * np.linalg.norm(np.ptp(positions, axis=0))
-    return Part("back faces", faces[:, ::-1], {"POSITION": positions - offset * normals, "NORMAL": -normals},
-                {"pbrMetallicRoughness": {"baseColorFactor": [*ORANGE, 1], "metallicFactor": 0,
-                                          "roughnessFactor": 0.8}, "alphaMode": "MASK"})
+    return Part(
+        "back faces",
+        faces[:, ::-1],
+        {"POSITION": positions - offset * normals, "NORMAL": -normals},
+        {
+            "pbrMetallicRoughness": {
+                "baseColorFactor": [*ORANGE, 1],
+                "metallicFactor": 0,
+                "roughnessFactor": 0.8,
+            },
+            "alphaMode": "MASK",
+        },
+    )
 
 
-def boundary_tubes(vertices: np.ndarray, faces: np.ndarray,
-                   radius: float) -> tuple[np.ndarray, np.ndarray] | None:
+def boundary_tubes(
+    vertices: np.ndarray, faces: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Thin open prisms along the boundary edges: vertices and faces; None for closed meshes."""
     edges, uses = mesh_edges(faces)
     edges = edges[uses == 1]
@@ -86,8 +120,13 @@ def boundary_tubes(vertices: np.ndarray, faces: np.ndarray,
     angle = 2 * np.pi * np.arange(_TUBE_SIDES) / _TUBE_SIDES
     ring = radius * (np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * other[:, None])
     # Reach a little past the ends, so that neighbours leave no gap.
-    points = np.concatenate([start[:, None] + ring - 0.5 * radius * along[:, None],
-                             end[:, None] + ring + 0.5 * radius * along[:, None]], axis=1)
+    points = np.concatenate(
+        [
+            start[:, None] + ring - 0.5 * radius * along[:, None],
+            end[:, None] + ring + 0.5 * radius * along[:, None],
+        ],
+        axis=1,
+    )
     i = np.arange(_TUBE_SIDES)
     j = (i + 1) % _TUBE_SIDES
     top_i, top_j = i + _TUBE_SIDES, j + _TUBE_SIDES

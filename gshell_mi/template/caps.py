@@ -64,8 +64,9 @@ def dented(vertices: np.ndarray, faces: np.ndarray, place: np.ndarray) -> np.nda
     return moved
 
 
-def put_in_place(sdf: np.ndarray, points: np.ndarray, moved: np.ndarray, faces: np.ndarray,
-                 caps: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
+def put_in_place(
+    sdf: np.ndarray, points: np.ndarray, moved: np.ndarray, faces: np.ndarray, caps: np.ndarray, cell: float
+) -> tuple[np.ndarray, np.ndarray]:
     """A signed distance whose surface passes through caps that have moved, and is the same elsewhere.
 
     Args:

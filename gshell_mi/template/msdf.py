@@ -55,8 +55,9 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
     return cleaned
 
 
-def reopened(values: np.ndarray, opened: np.ndarray, smooth: MeshDiffusion,
-             scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def reopened(
+    values: np.ndarray, opened: np.ndarray, smooth: MeshDiffusion, scale: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Gives a template other openings, with smooth rims where they differ.
 
     Args:
@@ -83,8 +84,7 @@ def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: Latti
     return dr.select(known, msdf, 1) * lattice.spacing
 
 
-def splat_to_lattice(values: mi.Float, template: SurfaceMesh,
-                     lattice: Lattice) -> tuple[mi.Float, mi.Bool]:
+def splat_to_lattice(values: mi.Float, template: SurfaceMesh, lattice: Lattice) -> tuple[mi.Float, mi.Bool]:
     """Turns values at the template's vertices, one or three channels, into a lattice field.
 
     Each lattice vertex takes the mean of the template vertices on its edges, weighted as they
@@ -102,8 +102,9 @@ def splat_to_lattice(values: mi.Float, template: SurfaceMesh,
     return LatticeDiffusion(lattice).extend(total, weight)
 
 
-def without_specks(msdf: mi.Float, template: SurfaceMesh, lattice: Lattice | BlockLattice,
-                   min_area: float) -> mi.Float:
+def without_specks(
+    msdf: mi.Float, template: SurfaceMesh, lattice: Lattice | BlockLattice, min_area: float
+) -> mi.Float:
     """ν without the cuts and the islands that are too small to be meant, see ``clean_opacity``."""
     vertices, faces, _ = template.to_numpy()
     msdf = dr.detach(msdf)
@@ -116,8 +117,13 @@ def without_specks(msdf: mi.Float, template: SurfaceMesh, lattice: Lattice | Blo
     return msdf
 
 
-def rewritten(msdf: mi.Float, values: np.ndarray, changed: np.ndarray, template: SurfaceMesh,
-              lattice: Lattice | BlockLattice) -> mi.Float:
+def rewritten(
+    msdf: mi.Float,
+    values: np.ndarray,
+    changed: np.ndarray,
+    template: SurfaceMesh,
+    lattice: Lattice | BlockLattice,
+) -> mi.Float:
     """ν with new values at the template's vertices that have changed.
 
     Only these are written: on its way over the mesh and back a field loses its details.
@@ -126,8 +132,9 @@ def rewritten(msdf: mi.Float, values: np.ndarray, changed: np.ndarray, template:
     return dr.select(weight > 0, total / dr.maximum(weight, 1e-12), msdf)
 
 
-def _splat(values: mi.Float, template: SurfaceMesh, lattice: Lattice | BlockLattice,
-           counted: mi.Bool) -> tuple[mi.Float, mi.Float]:
+def _splat(
+    values: mi.Float, template: SurfaceMesh, lattice: Lattice | BlockLattice, counted: mi.Bool
+) -> tuple[mi.Float, mi.Float]:
     """Sums, over the counted vertices of the template, of weighted values and of weights."""
     channels = dr.width(values) // template.vertex_count
     total = dr.zeros(mi.Float, channels * lattice.vertex_count)

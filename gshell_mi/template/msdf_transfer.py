@@ -46,8 +46,9 @@ def transfer_msdf(subject: mi.Shape, coarse: LatticeFields, fine: LatticeFields)
     return dataclasses.replace(fine, msdf=msdf.numpy())
 
 
-def _template(subject: mi.Shape,
-              fields: LatticeFields) -> tuple[np.ndarray, np.ndarray, SurfaceMesh, np.ndarray]:
+def _template(
+    subject: mi.Shape, fields: LatticeFields
+) -> tuple[np.ndarray, np.ndarray, SurfaceMesh, np.ndarray]:
     """Vertices (V, 3) and faces (F, 3) of a template, the template, and the mSDF (V,) at its vertices."""
     template = subject.surface_of(fields, template=True)
     vertices, faces, _ = template.to_numpy()

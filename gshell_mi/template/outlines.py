@@ -46,10 +46,14 @@ class Outlines:
         diagonal = float(max(np.hypot(*size) for size in views.sizes))
         alphas = [target.most_alpha for target in targets]
         thin_parts = sharp(alphas)
-        distances = [mask_distance(alpha, fill_holes=False, thin_parts=thin_parts).clip(-diagonal, diagonal)
-                     for alpha in alphas]
-        distances = [np.where(_beside_unknown(target), diagonal, distance)
-                     for target, distance in zip(targets, distances, strict=True)]
+        distances = [
+            mask_distance(alpha, fill_holes=False, thin_parts=thin_parts).clip(-diagonal, diagonal)
+            for alpha in alphas
+        ]
+        distances = [
+            np.where(_beside_unknown(target), diagonal, distance)
+            for target, distance in zip(targets, distances, strict=True)
+        ]
         counts = views.sizes.prod(axis=1)
         self._distances = mi.Float(np.concatenate([d.ravel() for d in distances]).astype(np.float32))
         self._first = mi.UInt32(np.concatenate([[0], np.cumsum(counts)[:-1]]))

@@ -55,9 +55,18 @@ _RIM = 2.0
 _FRACTIONS = (1.0, 0.7, 0.4)
 
 
-def revoxelise(subject: mi.Shape, lattice: Lattice, vertices: np.ndarray, moved: np.ndarray,
-               faces: np.ndarray, logits: np.ndarray, radiance: np.ndarray, min_area: float, wanted: Topology,
-               fewest_loops: int | None = None) -> dict[str, np.ndarray] | None:
+def revoxelise(
+    subject: mi.Shape,
+    lattice: Lattice,
+    vertices: np.ndarray,
+    moved: np.ndarray,
+    faces: np.ndarray,
+    logits: np.ndarray,
+    radiance: np.ndarray,
+    min_area: float,
+    wanted: Topology,
+    fewest_loops: int | None = None,
+) -> dict[str, np.ndarray] | None:
     """Fields whose surface is the moved template's, with its openings.
 
     Args:
@@ -88,8 +97,12 @@ def revoxelise(subject: mi.Shape, lattice: Lattice, vertices: np.ndarray, moved:
         surface = subject.surface_of(dataclasses.replace(closed, msdf=fields["msdf"]))
         surface_vertices, surface_faces, _ = surface.to_numpy()
         found = topology(surface_vertices, surface_faces)
-        torn = is_torn(surface_vertices, surface_faces, *positive_part(placed, faces, logits),
-                       _RIM * lattice.spacing * subject.length_scale)
+        torn = is_torn(
+            surface_vertices,
+            surface_faces,
+            *positive_part(placed, faces, logits),
+            _RIM * lattice.spacing * subject.length_scale,
+        )
         if found.boundary_loops >= fewest_loops and found.components <= wanted.components and not torn:
             if found.pinholes <= wanted.pinholes:
                 return fields
@@ -98,8 +111,16 @@ def revoxelise(subject: mi.Shape, lattice: Lattice, vertices: np.ndarray, moved:
     return nearly
 
 
-def _fields(subject: mi.Shape, lattice: Lattice, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray,
-            logits: np.ndarray, radiance: np.ndarray, min_area: float) -> dict[str, np.ndarray] | None:
+def _fields(
+    subject: mi.Shape,
+    lattice: Lattice,
+    vertices: np.ndarray,
+    moved: np.ndarray,
+    faces: np.ndarray,
+    logits: np.ndarray,
+    radiance: np.ndarray,
+    min_area: float,
+) -> dict[str, np.ndarray] | None:
     solid = logits > 0
     to_lattice = np.linalg.inv(np.array(subject.to_world.matrix, np.float64))
     before, local = (points @ to_lattice[:3, :3].T + to_lattice[:3, 3] for points in (vertices, moved))
@@ -113,20 +134,26 @@ def _fields(subject: mi.Shape, lattice: Lattice, vertices: np.ndarray, moved: np
     new_vertices, new_faces, _ = template.to_numpy()
     placed = new_vertices @ to_lattice[:3, :3].T + to_lattice[:3, 3]
     placed_faces = new_faces if local_faces is faces else new_faces[:, ::-1]
-    values = values_nearby(local, local_faces, np.column_stack([logits, radiance]), placed, placed_faces,
-                           _REACH * lattice.spacing)
+    values = values_nearby(
+        local,
+        local_faces,
+        np.column_stack([logits, radiance]),
+        placed,
+        placed_faces,
+        _REACH * lattice.spacing,
+    )
     # A very sure side must not outvote the other one at the lattice's vertices between them.
     limited = np.clip(values[:, 0], -_CERTAIN, _CERTAIN)
     msdf = msdf_from_template(clean_opacity(limited, new_vertices, new_faces, min_area), template, lattice)
     msdf = without_specks(msdf, template, lattice, min_area)
     colour = mi.Float(np.ascontiguousarray(values[:, 1:], np.float32).ravel())
     seen, known = splat_to_lattice(colour, template, lattice)
-    return {"sdf": sdf, "msdf": msdf.numpy(),
-            "radiance": seen.numpy().reshape(-1, 3), "known": known.numpy()}
+    return {"sdf": sdf, "msdf": msdf.numpy(), "radiance": seen.numpy().reshape(-1, 3), "known": known.numpy()}
 
 
-def is_torn(vertices: np.ndarray, faces: np.ndarray, cut_vertices: np.ndarray, cut_faces: np.ndarray,
-            near: float) -> bool:
+def is_torn(
+    vertices: np.ndarray, faces: np.ndarray, cut_vertices: np.ndarray, cut_faces: np.ndarray, near: float
+) -> bool:
     """Whether a surface has a boundary, pin-holes aside, where the cut template that it is to be has none."""
     boundary, loop = boundary_edges(faces)
     if len(boundary) == 0:
@@ -142,8 +169,9 @@ def is_torn(vertices: np.ndarray, faces: np.ndarray, cut_vertices: np.ndarray, c
     return bool(((np.bincount(loop, length * far) > 0.5 * whole) & (whole > PINHOLE * diagonal)).any())
 
 
-def thickened(before: np.ndarray, moved: np.ndarray, faces: np.ndarray, solid: np.ndarray,
-              cell: float) -> np.ndarray:
+def thickened(
+    before: np.ndarray, moved: np.ndarray, faces: np.ndarray, solid: np.ndarray, cell: float
+) -> np.ndarray:
     """Moves the sides of thin parts apart: the open side if there is one, otherwise both by half.
 
     Args:

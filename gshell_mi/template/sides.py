@@ -9,8 +9,9 @@ import trimesh
 from ..compat import mesh_scene
 
 
-def opposite_sides(before: np.ndarray, moved: np.ndarray, faces: np.ndarray,
-                   cell: float) -> tuple[np.ndarray, np.ndarray]:
+def opposite_sides(
+    before: np.ndarray, moved: np.ndarray, faces: np.ndarray, cell: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Thickness of a template under each vertex, and what is on its other side.
 
     Two sides that were opposite each other and moved through each other have a negative thickness; rays in
@@ -39,8 +40,9 @@ def opposite_sides(before: np.ndarray, moved: np.ndarray, faces: np.ndarray,
     return thickness, opposite
 
 
-def cast(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray,
-         reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def cast(
+    vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray, reach: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Face, barycentric weights (0 without a hit) and distance (infinite then) of rays on a mesh."""
     o, d = (np.ascontiguousarray(x.T, np.float32) for x in (origins, directions))
     ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d), reach, 0, [])

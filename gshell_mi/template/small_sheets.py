@@ -19,8 +19,9 @@ _LOOSE = 0.05
 _SHEET = 1.5
 
 
-def small_sheets(moved: np.ndarray, normals: np.ndarray, faces: np.ndarray, others: np.ndarray,
-                 thickness: float) -> tuple[np.ndarray, int]:
+def small_sheets(
+    moved: np.ndarray, normals: np.ndarray, faces: np.ndarray, others: np.ndarray, thickness: float
+) -> tuple[np.ndarray, int]:
     """One side of each, and their number.
 
     Args:
@@ -51,8 +52,9 @@ def small_sheets(moved: np.ndarray, normals: np.ndarray, faces: np.ndarray, othe
     return side, count
 
 
-def loose_sheets(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, opened: np.ndarray,
-                 cell: float) -> tuple[np.ndarray, np.ndarray]:
+def loose_sheets(
+    vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, opened: np.ndarray, cell: float
+) -> tuple[np.ndarray, np.ndarray]:
     """One side (V,) of each small part that is a closed sheet, and both (V,); none if the surface is closed.
 
     What such a part borders of openings must be small beside it, as a neck that has been cut, by which the

@@ -66,8 +66,9 @@ class Cut:
     fewest_loops: int
 
 
-def collapsed_sheets(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: float,
-                     sheet_thickness: float, min_area: float) -> Cut | None:
+def collapsed_sheets(
+    cut: Cut, before: np.ndarray, faces: np.ndarray, cell: float, sheet_thickness: float, min_area: float
+) -> Cut | None:
     """A moved template without the sides that it can do without; None if there are none, or it would fall
     apart.
 
@@ -82,8 +83,9 @@ def collapsed_sheets(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: floa
     solid = cut.logits > 0
     thickness, opposite = opposite_sides(before, cut.positions, faces, cell)
     normals, smooth = normals_at_vertices(before, faces), MeshDiffusion(faces, len(solid), _SMOOTHING)
-    redundant, sheets = redundant_sides(thickness, opposite, normals, faces, solid, smooth, cell,
-                                        sheet_thickness)
+    redundant, sheets = redundant_sides(
+        thickness, opposite, normals, faces, solid, smooth, cell, sheet_thickness
+    )
     small, count = small_sheets(cut.positions, normals, faces, ~solid | redundant, sheet_thickness * cell)
     redundant, sheets = redundant | small, sheets + count
     if not redundant.any():
@@ -98,13 +100,24 @@ def collapsed_sheets(cut: Cut, before: np.ndarray, faces: np.ndarray, cell: floa
         return None
     thickness, opposite = opposite_sides(before, before, faces, cell)
     opposite = np.where(np.isfinite(thickness), opposite, -1)
-    return Cut(logits, carried(before, cut.positions, redundant, opposite, smooth), left,
-               min(cut.fewest_loops + sheets, left.boundary_loops))
+    return Cut(
+        logits,
+        carried(before, cut.positions, redundant, opposite, smooth),
+        left,
+        min(cut.fewest_loops + sheets, left.boundary_loops),
+    )
 
 
-def redundant_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.ndarray, faces: np.ndarray,
-                    solid: np.ndarray, smooth: MeshDiffusion, cell: float,
-                    sheet_thickness: float) -> tuple[np.ndarray, int]:
+def redundant_sides(
+    thickness: np.ndarray,
+    opposite: np.ndarray,
+    normals: np.ndarray,
+    faces: np.ndarray,
+    solid: np.ndarray,
+    smooth: MeshDiffusion,
+    cell: float,
+    sheet_thickness: float,
+) -> tuple[np.ndarray, int]:
     """Sides of thin parts that may go: those beside openings, and one of a part that is nothing but a sheet.
 
     Args:
@@ -133,8 +146,12 @@ def redundant_sides(thickness: np.ndarray, opposite: np.ndarray, normals: np.nda
     redundant = solid & np.where(decided, opened, _balanced(opened, thin, opposite, edges, smooth) < 0)
     # A fin of something solid is no sheet, nor is a plate, whose sides stay apart.
     share = np.bincount(part, redundant) / np.maximum(np.bincount(part, solid), 1)
-    sheets = [index for index in np.unique(part[candidates]) if share[index] > _SHEET_SHARE
-              and np.median(thickness[candidates[part[candidates] == index]]) < sheet_thickness * cell]
+    sheets = [
+        index
+        for index in np.unique(part[candidates])
+        if share[index] > _SHEET_SHARE
+        and np.median(thickness[candidates[part[candidates] == index]]) < sheet_thickness * cell
+    ]
     return redundant & (~closed | np.isin(part, sheets)), len(sheets)
 
 
@@ -182,8 +199,9 @@ def _cut_off(opened: np.ndarray, solid: np.ndarray, edges: np.ndarray) -> np.nda
     return ~opened & (size < _CUT_OFF * largest)
 
 
-def _balanced(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges: np.ndarray,
-              smooth: MeshDiffusion) -> np.ndarray:
+def _balanced(
+    opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges: np.ndarray, smooth: MeshDiffusion
+) -> np.ndarray:
     """(V,) negative where open: smooth along the mesh, of opposite sign on the two sides of thin parts."""
     signs = np.where(opened, -1.0, 1.0)
     free = thin
@@ -197,8 +215,9 @@ def _balanced(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges:
     return result
 
 
-def carried(before: np.ndarray, moved: np.ndarray, redundant: np.ndarray, opposite: np.ndarray,
-            smooth: MeshDiffusion) -> np.ndarray:
+def carried(
+    before: np.ndarray, moved: np.ndarray, redundant: np.ndarray, opposite: np.ndarray, smooth: MeshDiffusion
+) -> np.ndarray:
     """(V, 3) positions in which redundant sides go where the sides that stay go.
 
     Alone they would end up in the other side or beyond: nothing keeps what the images hardly tell apart.

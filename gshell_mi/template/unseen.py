@@ -20,8 +20,9 @@ _GRAZING = 0.2
 _SMOOTHING = 3.0
 
 
-def without_unseen(subject: mi.Shape, fields: LatticeFields, views: PinholeViews,
-                   min_area: float) -> mi.Float | None:
+def without_unseen(
+    subject: mi.Shape, fields: LatticeFields, views: PinholeViews, min_area: float
+) -> mi.Float | None:
     """The mSDF that also cuts away what no view sees from either side; None if that is little.
 
     Args:

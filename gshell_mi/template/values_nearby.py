@@ -12,8 +12,14 @@ from .sides import cast, normals_at_vertices
 _NEIGHBOURS = 8
 
 
-def values_nearby(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray, points: np.ndarray,
-                  point_faces: np.ndarray, reach: float) -> np.ndarray:
+def values_nearby(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    values: np.ndarray,
+    points: np.ndarray,
+    point_faces: np.ndarray,
+    reach: float,
+) -> np.ndarray:
     """(n, k) values at the vertices ``points`` of a mesh near another one, from (V, k) at that one's.
 
     The nearest hit along the normal counts that faces the same way, which is no hit on the other side of a

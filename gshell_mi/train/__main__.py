@@ -29,9 +29,14 @@ class _Arguments:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return run_command("train", "Train a generative model.", _Arguments, _train, arguments,
-                       interrupted=lambda given: f"Interrupted; run the same command again to go on with "
-                                                 f"'{given.output}'.")
+    return run_command(
+        "train",
+        "Train a generative model.",
+        _Arguments,
+        _train,
+        arguments,
+        interrupted=lambda given: f"Interrupted; run the same command again to go on with '{given.output}'.",
+    )
 
 
 def _train(given: _Arguments) -> None:

@@ -31,13 +31,15 @@ class _Arguments:
     quiet: bool = False
     """No progress bar."""
     config: Annotated[TurntableConfig, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=TurntableConfig)
+        default_factory=TurntableConfig
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return run_command("turntable", "Render a turntable of a fitted object.", _Arguments, _turntable,
-                       arguments)
+    return run_command(
+        "turntable", "Render a turntable of a fitted object.", _Arguments, _turntable, arguments
+    )
 
 
 def _turntable(given: _Arguments) -> None:

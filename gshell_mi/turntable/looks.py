@@ -62,8 +62,16 @@ class Studio:
         denoise: filter path-traced pictures with Open Image Denoise.
     """
 
-    def __init__(self, mesh_file: Path, light: mi.Emitter, look: Look, *, spp: int = 32, max_depth: int = 5,
-                 denoise: bool = False):
+    def __init__(
+        self,
+        mesh_file: Path,
+        light: mi.Emitter,
+        look: Look,
+        *,
+        spp: int = 32,
+        max_depth: int = 5,
+        denoise: bool = False,
+    ):
         self.look, self._spp, self._denoise = look, spp, denoise
         front = {"type": "diffuse", "reflectance": {"type": "rgb", "value": _GREY}}
         if look.channel == "shaded":
@@ -71,16 +79,21 @@ class Studio:
         bsdf = {"type": "twosided", "front": front}
         if look.orange_back:
             bsdf["back"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(ORANGE)}}
-        self._scene = mi.load_dict({
-            "type": "scene", "light": light,
-            "subject": {"type": "ply", "filename": str(mesh_file), "bsdf": bsdf}})
+        self._scene = mi.load_dict(
+            {
+                "type": "scene",
+                "light": light,
+                "subject": {"type": "ply", "filename": str(mesh_file), "bsdf": bsdf},
+            }
+        )
         self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
 
     def render(self, sensor: mi.Sensor, seed: int = 0) -> np.ndarray:
         """(h, w, 4) linear, premultiplied by alpha."""
         if self.look.channel in ("shaded", "geometry"):
-            image = np.array(mi.render(self._scene, sensor=sensor, integrator=self._integrator, spp=self._spp,
-                                       seed=seed))
+            image = np.array(
+                mi.render(self._scene, sensor=sensor, integrator=self._integrator, spp=self._spp, seed=seed)
+            )
             if self._denoise:
                 image[..., :3] = _denoised(image[..., :3])
             if not self.look.wireframe:
@@ -109,8 +122,9 @@ class Studio:
         means = [np.array(dr.block_sum(x, _CAST_SAMPLES)) / _CAST_SAMPLES for x in channels]
         return np.stack(means, axis=-1).reshape(height, width, 4)
 
-    def _unlit(self, si: mi.SurfaceInteraction3f, preliminary: mi.PreliminaryIntersection3f,
-               pixel_size: mi.Float) -> tuple[mi.Color3f, mi.Float]:
+    def _unlit(
+        self, si: mi.SurfaceInteraction3f, preliminary: mi.PreliminaryIntersection3f, pixel_size: mi.Float
+    ) -> tuple[mi.Color3f, mi.Float]:
         shape = self._scene.shapes()[0]
         if self.look.channel == "normal":
             color = mi.Color3f(0.5 * si.sh_frame.n + 0.5)
@@ -122,8 +136,9 @@ class Studio:
             color = dr.select(dr.dot(si.n, si.to_world(si.wi)) < 0, mi.Color3f(ORANGE), color)
         return color, mi.Float(1)
 
-    def _wires(self, si: mi.SurfaceInteraction3f, preliminary: mi.PreliminaryIntersection3f,
-               pixel_size: mi.Float) -> tuple[mi.Color3f, mi.Float]:
+    def _wires(
+        self, si: mi.SurfaceInteraction3f, preliminary: mi.PreliminaryIntersection3f, pixel_size: mi.Float
+    ) -> tuple[mi.Color3f, mi.Float]:
         """Black along the edges: the distance to the nearest one against the size of a pixel there."""
         shape = self._scene.shapes()[0]
         prim = dr.select(preliminary.is_valid(), preliminary.prim_index, 0)

@@ -57,14 +57,17 @@ class TurntableConfig:
         if not -89 <= self.elevation <= 89:
             raise UserError(f"--elevation lies between -89 and 89 degrees, unlike {self.elevation:g}.")
         if not 2 <= self.max_depth <= memory.LONGEST_PATH:
-            raise UserError(f"--max-depth must be at least 2 (direct light) and at most "
-                            f"{memory.LONGEST_PATH}, not {self.max_depth}.")
+            raise UserError(
+                f"--max-depth must be at least 2 (direct light) and at most "
+                f"{memory.LONGEST_PATH}, not {self.max_depth}."
+            )
         if self.channel not in CHANNELS:
             raise UserError(f"--channel '{self.channel}' is unknown; choose one of {', '.join(CHANNELS)}.")
 
 
-def render_turntable(folder: Path, config: TurntableConfig | None = None, *,
-                     envmap: Path | None = None) -> Iterator[np.ndarray]:
+def render_turntable(
+    folder: Path, config: TurntableConfig | None = None, *, envmap: Path | None = None
+) -> Iterator[np.ndarray]:
     """The frames of a fit's turntable, (size, size, 3) sRGB in [0, 1] in front of white, one at a time.
 
     The camera circles the axis that is up in the fit's views; the light stays.
@@ -79,8 +82,13 @@ def render_turntable(folder: Path, config: TurntableConfig | None = None, *,
             memory for a picture.
     """
     config = config or TurntableConfig()
-    memory.require_for_image(config.size, config.size, config.spp, "A picture of the turntable",
-                             "lower its size or its samples per pixel")
+    memory.require_for_image(
+        config.size,
+        config.size,
+        config.spp,
+        "A picture of the turntable",
+        "lower its size or its samples per pixel",
+    )
     scene = load_fitted_scene(Path(folder), envmap)
     mesh_file = Path(folder) / "mesh.ply"
     mesh = read_ply(mesh_file)
@@ -88,8 +96,9 @@ def render_turntable(folder: Path, config: TurntableConfig | None = None, *,
         raise UserError(f"'{mesh_file}' is empty; there is nothing to show.")
     denoise = config.denoise and denoiser_available()
     look = Look(config.channel, config.orange_back, config.wireframe)
-    studio = Studio(mesh_file, scene.emitters()[0], look, spp=config.spp, max_depth=config.max_depth,
-                    denoise=denoise)
+    studio = Studio(
+        mesh_file, scene.emitters()[0], look, spp=config.spp, max_depth=config.max_depth, denoise=denoise
+    )
     cameras = orbit(mesh.vertices, up_axis(scene.sensors()), config.frames, config.elevation, config.size)
     return (over_white(studio.render(camera, seed)) for seed, camera in enumerate(cameras))
 
@@ -107,10 +116,20 @@ def orbit(vertices: np.ndarray, axis: int, count: int, elevation: float, size: i
         toward = np.cos(np.radians(elevation)) * level + np.sin(np.radians(elevation)) * up
         # A box filter, as denoisers expect noise that is independent from pixel to pixel.
         origin = center + distance * toward
-        yield mi.load_dict({
-            "type": "perspective", "fov": _FOV,
-            # Mitsuba's own would be 0.01 and 10 000, whatever the object's units.
-            "near_clip": 1e-3 * float(distance), "far_clip": 1e3 * float(distance),
-            "to_world": mi.ScalarTransform4f().look_at(list(origin), list(center), list(up)),
-            "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba",
-                     "rfilter": {"type": "box"}}})
+        yield mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": _FOV,
+                # Mitsuba's own would be 0.01 and 10 000, whatever the object's units.
+                "near_clip": 1e-3 * float(distance),
+                "far_clip": 1e3 * float(distance),
+                "to_world": mi.ScalarTransform4f().look_at(list(origin), list(center), list(up)),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": size,
+                    "height": size,
+                    "pixel_format": "rgba",
+                    "rfilter": {"type": "box"},
+                },
+            }
+        )

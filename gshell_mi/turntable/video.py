@@ -29,8 +29,9 @@ def write_video(frames: Iterable[np.ndarray], path: Path, fps: float, *, gif: bo
     """
     path = Path(path)
     if trouble := name_trouble(path.name, in_scene=False):
-        raise UserError(f"The name of the film '{str(path)[:80]}' {trouble}; give one such as turntable.mp4 "
-                        f"with -o.")
+        raise UserError(
+            f"The name of the film '{str(path)[:80]}' {trouble}; give one such as turntable.mp4 with -o."
+        )
     path = path.with_suffix(".mp4")
     files = [path, path.with_suffix(".gif")] if gif else [path]
     try:
@@ -41,11 +42,18 @@ def write_video(frames: Iterable[np.ndarray], path: Path, fps: float, *, gif: bo
             film, *animation = [stack.enter_context(replacing(file)) for file in files]
             pictures = _write_film(frames, film, fps, keep=gif)
             if gif:
-                pictures[0].save(animation[0], save_all=True, append_images=pictures[1:], loop=0,
-                                 duration=max(20, round(1000 / fps)), comment=TAG.encode())
+                pictures[0].save(
+                    animation[0],
+                    save_all=True,
+                    append_images=pictures[1:],
+                    loop=0,
+                    duration=max(20, round(1000 / fps)),
+                    comment=TAG.encode(),
+                )
     except OSError as error:
-        raise UserError(f"'{path}' cannot be written ({error.strerror or error}); choose another file with "
-                        f"-o.") from error
+        raise UserError(
+            f"'{path}' cannot be written ({error.strerror or error}); choose another file with -o."
+        ) from error
     return files
 
 
@@ -73,16 +81,42 @@ def _ffmpeg(path: Path, size: tuple[int, int], fps: float) -> Iterator[IO[bytes]
     """
     width, height = size
     command = [
-        imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-y", "-v", "error",
-        "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:.6g}", "-i", "-",
-        "-an", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart",
-        "-metadata", f"comment={TAG}", "-f", "mp4",
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-nostdin",
+        "-y",
+        "-v",
+        "error",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-s",
+        f"{width}x{height}",
+        "-r",
+        f"{fps:.6g}",
+        "-i",
+        "-",
+        "-an",
+        "-c:v",
+        "libx264",
+        "-pix_fmt",
+        "yuv420p",
+        "-crf",
+        "20",
+        "-movflags",
+        "+faststart",
+        "-metadata",
+        f"comment={TAG}",
+        "-f",
+        "mp4",
         # As it is, ffmpeg would take a name for an option, an address or a list.
-        f"file:{path.absolute()}"]
+        f"file:{path.absolute()}",
+    ]
     with tempfile.TemporaryFile() as told:
         # Of a session of its own, or Ctrl-C would end it before us.
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=told,
-                                   start_new_session=True)
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=told, start_new_session=True
+        )
         broken = False
         try:
             try:

@@ -47,8 +47,9 @@ def guarded_server() -> Iterator[None]:
 
     serve, guarded = server.serve, []
 
-    def serve_guarded(*arguments: Any, process_request: Callable[..., Any] | None = None,
-                      **others: Any) -> Any:
+    def serve_guarded(
+        *arguments: Any, process_request: Callable[..., Any] | None = None, **others: Any
+    ) -> Any:
         def answer(connection: ServerConnection, request: Request) -> Any:
             if not is_own(request.headers.get("Host"), request.headers.get("Origin")):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "This page belongs to another origin.\n")
@@ -63,8 +64,10 @@ def guarded_server() -> Iterator[None]:
     finally:
         server.serve = serve
     if not guarded:
-        raise UserError("This version of viser cannot be kept to its own page; install another one, or leave "
-                        "out --viewer.")
+        raise UserError(
+            "This version of viser cannot be kept to its own page; install another one, or leave "
+            "out --viewer."
+        )
 
 
 def free_port(first: int) -> int:

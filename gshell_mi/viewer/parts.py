@@ -22,8 +22,7 @@ def mesh_parts(preview: Preview) -> list[Part]:
     faces, positions = faces.reshape(-1, 3), preview.vertices[used]
     normals = vertex_normals(positions, faces)
     front = {"POSITION": positions, "NORMAL": normals, "COLOR_0": np.clip(preview.colors[used], 0, 1)}
-    return [Part("open mesh", faces, front, _matte([1, 1, 1, 1])),
-            back_faces(positions, normals, faces)]
+    return [Part("open mesh", faces, front, _matte([1, 1, 1, 1])), back_faces(positions, normals, faces)]
 
 
 def template_part(preview: Preview) -> list[Part]:
@@ -31,9 +30,14 @@ def template_part(preview: Preview) -> list[Part]:
     if len(preview.template_faces) == 0:
         return []
     normals = vertex_normals(preview.template_vertices, preview.template_faces)
-    return [Part("template", preview.template_faces,
-                 {"POSITION": preview.template_vertices, "NORMAL": normals},
-                 _matte([0.25, 0.4, 0.7, 0.35]) | {"alphaMode": "BLEND"})]
+    return [
+        Part(
+            "template",
+            preview.template_faces,
+            {"POSITION": preview.template_vertices, "NORMAL": normals},
+            _matte([0.25, 0.4, 0.7, 0.35]) | {"alphaMode": "BLEND"},
+        )
+    ]
 
 
 def _matte(color: list[float]) -> dict:

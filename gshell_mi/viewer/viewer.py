@@ -60,8 +60,10 @@ class Viewer:
         try:
             import viser
         except ImportError as error:
-            raise UserError("The live view needs viser, which is not installed; run 'pip install "
-                            "gshell_mi[viewer]' or leave out --viewer.") from error
+            raise UserError(
+                "The live view needs viser, which is not installed; run 'pip install "
+                "gshell_mi[viewer]' or leave out --viewer."
+            ) from error
         port = free_port(port)
         with _quiet(), guarded_server():
             self._server = viser.ViserServer(host="127.0.0.1", port=port, label="gshell_mi", verbose=False)
@@ -70,8 +72,11 @@ class Viewer:
         gui = self._server.gui
         self._status = gui.add_markdown("Reading the targets ...")
         self._curve = gui.add_uplot(
-            (np.zeros(1), np.ones(1)), ({"label": "step"}, {"label": "loss", "stroke": "#c2571a"}),
-            scales={"x": {"time": False}, "y": {"distr": 3}}, aspect=1.6)
+            (np.zeros(1), np.ones(1)),
+            ({"label": "step"}, {"label": "loss", "stroke": "#c2571a"}),
+            scales={"x": {"time": False}, "y": {"distr": 3}},
+            aspect=1.6,
+        )
         self._handles: dict[str, list] = {}
         for name, shown in (("open mesh", True), ("template", False), ("cameras", False)):
             box = gui.add_checkbox(name, shown)
@@ -118,16 +123,22 @@ class Viewer:
             axes = [across / np.linalg.norm(across), down / np.linalg.norm(down)]
             rotation = np.stack([*axes, np.cross(*axes)], axis=1)
             handle = self._server.scene.add_camera_frustum(
-                f"/cameras/{name}", fov=2 * np.arctan(np.linalg.norm(down) / 2),
+                f"/cameras/{name}",
+                fov=2 * np.arctan(np.linalg.norm(down) / 2),
                 aspect=float(np.linalg.norm(across) / np.linalg.norm(down)),
                 scale=_FRUSTUM * float(np.linalg.norm(origin - centre)),
                 image=_thumbnail(fit.targets[index].rgba) if index in pictured else None,
-                thickness=1.5, thickness_units="screen", visible=False,
-                wxyz=viser.transforms.SO3.from_matrix(rotation).wxyz, position=origin)
+                thickness=1.5,
+                thickness_units="screen",
+                visible=False,
+                wxyz=viser.transforms.SO3.from_matrix(rotation).wxyz,
+                position=origin,
+            )
             self._handles["cameras"].append(handle)
 
-    def step(self, stage: str, iteration: int, count: int, values: dict[str, float],
-             preview: Callable[[], Preview]) -> None:
+    def step(
+        self, stage: str, iteration: int, count: int, values: dict[str, float], preview: Callable[[], Preview]
+    ) -> None:
         """Shows the state of the fit, if the last time is long enough ago."""
         if stage != self._stage:
             self._stage, self._due, self._losses = stage, 0.0, []
@@ -136,8 +147,10 @@ class Viewer:
         if begin < self._due and iteration + 1 < count:
             return
         self._show(preview())
-        self._status.content = (f"**{stage}**, step {iteration + 1} of {count}\n\n"
-                                f"loss {values['loss']:.4f}, PSNR {values['psnr']:.1f} dB")
+        self._status.content = (
+            f"**{stage}**, step {iteration + 1} of {count}\n\n"
+            f"loss {values['loss']:.4f}, PSNR {values['psnr']:.1f} dB"
+        )
         losses = np.maximum(np.array(self._losses), 1e-8)  # of a logarithmic axis
         self._curve.data = (np.arange(iteration + 1 - len(losses), iteration + 1, dtype=float), losses)
         self._server.flush()

@@ -18,15 +18,29 @@ from .trials import Trial, run_trials
 Page = Callable[[list[Path], FitConfig, Path, str], str]
 
 
-def add_common_arguments(parser: argparse.ArgumentParser, scenes: list[Path], output: str,
-                         page: Path) -> None:
+def add_common_arguments(
+    parser: argparse.ArgumentParser, scenes: list[Path], output: str, page: Path
+) -> None:
     """Scenes, shared settings and where things are written; what follows the parser are defaults."""
-    parser.add_argument("scenes", nargs="*", type=Path, default=scenes, metavar="SCENE.xml",
-                        help=f"default: {', '.join(scene.stem for scene in scenes)}")
-    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", dest="settings",
-                        help="settings of all fits instead of the defaults")
-    parser.add_argument("-o", "--output", type=Path, default=Path(output),
-                        help="folder of the fits and their scores")
+    parser.add_argument(
+        "scenes",
+        nargs="*",
+        type=Path,
+        default=scenes,
+        metavar="SCENE.xml",
+        help=f"default: {', '.join(scene.stem for scene in scenes)}",
+    )
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE",
+        dest="settings",
+        help="settings of all fits instead of the defaults",
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path(output), help="folder of the fits and their scores"
+    )
     parser.add_argument("--page", type=Path, default=page, help="the Markdown file to write")
     parser.add_argument("--page-only", action="store_true", help="make no fit, write what there is")
     parser.add_argument("--bars", action="store_true", help="show the progress of every stage of every fit")

@@ -33,6 +33,7 @@ class Figure:
 
 def _count(title: str, name: str) -> Figure:
     """A count of the mesh: as near to the truth's as it was."""
+
     def band(stored: float, scores: dict) -> Band:
         true = scores["mesh"][name]["reference"]
         return true - abs(stored - true), true + abs(stored - true)
@@ -58,14 +59,27 @@ FIGURES = {
     "components": _count("components", "components"),
     "nonmanifold_edges": _count("non-manifold", "nonmanifold_edges"),
     "rim": Figure("rim", _rim, _near_one, 2),
-    "chamfer": Figure("chamfer %", lambda scores: scores["mesh"]["chamfer"],
-                      lambda stored, _: (None, stored + max(0.01, 0.1 * stored)), 3),
-    "f_score": Figure("F-score", lambda scores: scores["mesh"]["f_score"],
-                      lambda stored, _: (stored - max(0.01, 0.1 * (1 - stored)), None), 3),
-    "novel_psnr": Figure("novel dB", lambda scores: scores["mean"]["psnr"],
-                         lambda stored, _: (stored - 0.6, None), 2),
-    "mask_iou": Figure("mask IoU", lambda scores: scores["mean"]["mask_iou"],
-                       lambda stored, _: (stored - max(0.001, 0.1 * (1 - stored)), None), 4),
+    "chamfer": Figure(
+        "chamfer %",
+        lambda scores: scores["mesh"]["chamfer"],
+        lambda stored, _: (None, stored + max(0.01, 0.1 * stored)),
+        3,
+    ),
+    "f_score": Figure(
+        "F-score",
+        lambda scores: scores["mesh"]["f_score"],
+        lambda stored, _: (stored - max(0.01, 0.1 * (1 - stored)), None),
+        3,
+    ),
+    "novel_psnr": Figure(
+        "novel dB", lambda scores: scores["mean"]["psnr"], lambda stored, _: (stored - 0.6, None), 2
+    ),
+    "mask_iou": Figure(
+        "mask IoU",
+        lambda scores: scores["mean"]["mask_iou"],
+        lambda stored, _: (stored - max(0.001, 0.1 * (1 - stored)), None),
+        4,
+    ),
 }
 
 
@@ -106,26 +120,36 @@ class Expectation:
         """
         try:
             document = read_json_object(path)
-            figures = {name: (entry["stored"], (entry["least"], entry["most"]))
-                       for name, entry in document["figures"].items()}
+            figures = {
+                name: (entry["stored"], (entry["least"], entry["most"]))
+                for name, entry in document["figures"].items()
+            }
             measured, fitted_by = document["measured"], document["fitted_by"]
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UserError(f"'{path}' is missing or holds no stored result ({error!r}); write it again "
-                            f"with make regress ARGS=--update.") from error
+            raise UserError(
+                f"'{path}' is missing or holds no stored result ({error!r}); write it again "
+                f"with make regress ARGS=--update."
+            ) from error
         if measured != bool(figures) or not set(figures) <= set(FIGURES):
-            raise UserError(f"'{path}' holds figures that are unknown, or says wrongly that it is measured; "
-                            f"write it again with make regress ARGS=--update.")
+            raise UserError(
+                f"'{path}' holds figures that are unknown, or says wrongly that it is measured; "
+                f"write it again with make regress ARGS=--update."
+            )
         return cls(fitted_by, figures)
 
     def save(self, path: Path) -> None:
         """Writes it as JSON, a figure in a line."""
-        lines = [f'  "{name}": {json.dumps({"stored": stored, "least": least, "most": most})}'
-                 for name, (stored, (least, most)) in self.figures.items()]
+        lines = [
+            f'  "{name}": {json.dumps({"stored": stored, "least": least, "most": most})}'
+            for name, (stored, (least, most)) in self.figures.items()
+        ]
         figures = "{\n" + ",\n".join(lines) + "\n }" if lines else "{}"
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial:
-            partial.write_text(f'{{\n "measured": {json.dumps(self.measured)},\n'
-                               f' "fitted_by": {json.dumps(self.fitted_by)},\n "figures": {figures}\n}}\n')
+            partial.write_text(
+                f'{{\n "measured": {json.dumps(self.measured)},\n'
+                f' "fitted_by": {json.dumps(self.fitted_by)},\n "figures": {figures}\n}}\n'
+            )
 
     def stored(self, name: str) -> float | None:
         """The stored number of a figure."""
@@ -157,8 +181,10 @@ def difference(before: Expectation, after: Expectation) -> list[str]:
 
 
 def _sentence(figure: Figure, value: float, by: float, side: str, bound: float) -> str:
-    return (f"{figure.title} is {figure.text(value)}, {by:.{figure.digits}f} {side} its band, which ends at "
-            f"{figure.text(bound)}")
+    return (
+        f"{figure.title} is {figure.text(value)}, {by:.{figure.digits}f} {side} its band, which ends at "
+        f"{figure.text(bound)}"
+    )
 
 
 def _rounded(bound: float | None) -> float | None:

@@ -46,8 +46,9 @@ def as_flags(changes: dict) -> str:
         flag = f"--{name.replace('_', '-')}"
         if isinstance(value, dict):
             value = " ".join(f"{key} {number:g}" for key, number in value.items())
-        words.append(flag if value is True else f"{flag} {value:g}" if isinstance(value, float)
-                     else f"{flag} {value}")
+        words.append(
+            flag if value is True else f"{flag} {value:g}" if isinstance(value, float) else f"{flag} {value}"
+        )
     return " ".join(words)
 
 

@@ -92,17 +92,28 @@ def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
         _render_views(inside / "reference.xml", trial.scene, inside)
     code, before = code_version(), time.process_time()
     try:
-        fitted = fit_scene(trial.scene, folder, config=trial.config, resume=resume, overwrite=not resume,
-                           report=False, quiet=quiet)
+        fitted = fit_scene(
+            trial.scene,
+            folder,
+            config=trial.config,
+            resume=resume,
+            overwrite=not resume,
+            report=False,
+            quiet=quiet,
+        )
         seconds = time.process_time() - before
         targets = inside / "test"
         if not targets.is_dir():
             targets = output / trial.scene.stem / "test_views"
         _render_views(inside / "reference.xml", inside / "test.xml", targets)
         scores = compare_fit(folder, targets=targets, sensors=inside / "test.xml", mesh=inside / "truth.ply")
-        outcome = Outcome(_plain(trial.config), {"mean": scores["mean"], "mesh": scores["mesh"]},
-                          None if resume else round(seconds, 1), fitted.metrics["seconds"]["total"],
-                          code)
+        outcome = Outcome(
+            _plain(trial.config),
+            {"mean": scores["mean"], "mesh": scores["mesh"]},
+            None if resume else round(seconds, 1),
+            fitted.metrics["seconds"]["total"],
+            code,
+        )
     except UserError as error:
         outcome = Outcome(_plain(trial.config), {}, None, 0.0, code, str(error))
     record = trial.record(output)
@@ -149,8 +160,10 @@ def summary(outcome: Outcome) -> str:
     if outcome.error:
         return f"failed: {outcome.error}"
     mesh, loops = outcome.scores["mesh"], outcome.scores["mesh"]["boundary_loops"]
-    return (f"loops {loops['found']} of {loops['reference']}, chamfer {mesh['chamfer']:.3f} %, "
-            f"{outcome.scores['mean']['psnr']:.2f} dB")
+    return (
+        f"loops {loops['found']} of {loops['reference']}, chamfer {mesh['chamfer']:.3f} %, "
+        f"{outcome.scores['mean']['psnr']:.2f} dB"
+    )
 
 
 def _render_views(reference: Path, sensors: Path, folder: Path) -> None:

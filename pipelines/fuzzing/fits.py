@@ -19,12 +19,23 @@ def _finished(folder: Path) -> None:
     from fitted import open_sphere, write_fit
 
     write_fit(folder, open_sphere(2), views=2, size=8)
-    (folder / "metrics.json").write_text(json.dumps({
-        "scene": "a.xml", "targets": "targets", "psnr_training": 30.0,
-        "training": {"views": {"view_000": {"psnr": 30.0}}, "mean": {"psnr": 30.0}},
-        "held_out": {"views": {"view_001": {"psnr": 20.0, "mask_iou": 0.9}}, "mean": {"psnr": 20.0}},
-        "versions": {}, "config": {}, "seconds": {"total": 1.0}, "warnings": ["one"],
-        "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1}}), encoding="utf-8")
+    (folder / "metrics.json").write_text(
+        json.dumps(
+            {
+                "scene": "a.xml",
+                "targets": "targets",
+                "psnr_training": 30.0,
+                "training": {"views": {"view_000": {"psnr": 30.0}}, "mean": {"psnr": 30.0}},
+                "held_out": {"views": {"view_001": {"psnr": 20.0, "mask_iou": 0.9}}, "mean": {"psnr": 20.0}},
+                "versions": {},
+                "config": {},
+                "seconds": {"total": 1.0},
+                "warnings": ["one"],
+                "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1},
+            }
+        ),
+        encoding="utf-8",
+    )
 
 
 def write_fit_with_targets(folder: Path) -> None:
@@ -51,12 +62,26 @@ def write_reported_fit(folder: Path) -> None:
     (folder / "out" / "views").mkdir(parents=True)
     _finished(folder / "out")
     write_asset(folder / "out", AssetConfig(texture_size=16, unwrap_seconds=5))
-    (folder / "out" / "log.jsonl").write_text("".join(
-        json.dumps({"stage": stage, "iteration": number, "color": 1.0 / (number + 1), "psnr": 20.0,
-                    "seconds": 0.1}) + "\n" for stage in ("ghost", "joint") for number in range(3)))
+    (folder / "out" / "log.jsonl").write_text(
+        "".join(
+            json.dumps(
+                {
+                    "stage": stage,
+                    "iteration": number,
+                    "color": 1.0 / (number + 1),
+                    "psnr": 20.0,
+                    "seconds": 0.1,
+                }
+            )
+            + "\n"
+            for stage in ("ghost", "joint")
+            for number in range(3)
+        )
+    )
     for number in range(2):
         Image.fromarray(np.zeros((8, 24, 3), np.uint8)).save(
-            folder / "out" / "views" / f"view_{number:03}.png")
+            folder / "out" / "views" / f"view_{number:03}.png"
+        )
     for name, width in (("held_out", 24), ("masks", 8)):
         (folder / "out" / name).mkdir()
         Image.fromarray(np.zeros((8, width, 3), np.uint8)).save(folder / "out" / name / "view_001.png")
@@ -74,8 +99,20 @@ def compare(folder: Path) -> None:
     """The command, images and mesh."""
     from gshell_mi.compare.__main__ import main
 
-    command(main, folder, "--targets", folder / "targets", "--mesh", folder / "template.ply",
-            "--spp", "1", "--json", folder / "out.json", "-o", folder / "out_errors")
+    command(
+        main,
+        folder,
+        "--targets",
+        folder / "targets",
+        "--mesh",
+        folder / "template.ply",
+        "--spp",
+        "1",
+        "--json",
+        folder / "out.json",
+        "-o",
+        folder / "out_errors",
+    )
 
 
 def export(folder: Path) -> None:
@@ -97,7 +134,8 @@ def write_checkpoint(folder: Path) -> None:
     from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
 
     Checkpoint(stage="joint", iteration=3, config={}, seconds={}, arrays={"a": np.ones(4, np.float32)}).save(
-        folder / "checkpoint.npz")
+        folder / "checkpoint.npz"
+    )
 
 
 def load_checkpoint(folder: Path) -> None:
@@ -157,8 +195,11 @@ def _find_of_views(path: Path) -> None:
     checkpoint = Checkpoint.load(path)
     ignored = np.zeros((SIZE, SIZE), bool)
     ignored[:, :3] = True
-    checkpoint.arrays |= {"gains": np.full((VIEWS, 3), 1.1, np.float32), "ignored": packed([ignored] * VIEWS),
-                          "poses": np.full((VIEWS, 6), 1e-3)}
+    checkpoint.arrays |= {
+        "gains": np.full((VIEWS, 3), 1.1, np.float32),
+        "ignored": packed([ignored] * VIEWS),
+        "poses": np.full((VIEWS, 6), 1e-3),
+    }
     checkpoint.save(path)
 
 
@@ -191,13 +232,24 @@ def judge_views(folder: Path) -> None:
     from gshell_mi.fit.surface import Surface
     from gshell_mi.scene import load_fit_scene
 
-    config = FitConfig().changed({"radiance.batch": 1024, "occlusion.most": 0.2, "occlusion.levels": 2,
-                                  "cameras.places": 500, "gains.places": 100})
+    config = FitConfig().changed(
+        {
+            "radiance.batch": 1024,
+            "occlusion.most": 0.2,
+            "occlusion.levels": 2,
+            "cameras.places": 500,
+            "gains.places": 100,
+        }
+    )
     scene = load_fit_scene(folder / "bowl.xml")
     given = Fit(scene, config, Lattices.of(scene.subject, config))
     surface = Surface(scene.subject.fields())
-    for stage in (Occlusion(config.occlusion), Hull(config.hull), Exposures(config.gains),
-                  Poses(config.cameras)):
+    for stage in (
+        Occlusion(config.occlusion),
+        Hull(config.hull),
+        Exposures(config.gains),
+        Poses(config.cameras),
+    ):
         surface = stage.run(given.corrected(surface), surface, Silent()).after(surface)
     given.corrected(surface)
 
@@ -218,13 +270,14 @@ def damage_pixels(path: Path, random: Random) -> None:
         pixels[..., :-1] *= random.choice((0.0, -1.0, 1e-20, 1e4, 1e30))
     elif kind == 3:
         pixels[random.randrange(len(pixels)), random.randrange(len(pixels))] = random.choice(
-            (0.0, 1.0, -1.0, 1e38, np.nan, np.inf))
+            (0.0, 1.0, -1.0, 1e38, np.nan, np.inf)
+        )
     elif kind == 4:
         pixels[...] = np.random.default_rng(random.randrange(2**32)).random(pixels.shape)
     elif kind == 5:
         pixels[...] = pixels[::-1].copy()
     elif kind == 6:
-        alpha[:, random.randrange(len(pixels)):] = random.choice((0.0, 1.0))
+        alpha[:, random.randrange(len(pixels)) :] = random.choice((0.0, 1.0))
     else:
         pixels[...] = np.roll(pixels, random.randrange(1, len(pixels)), axis=random.randrange(2))
     kinds = {1: mi.Bitmap.PixelFormat.Y, 4: mi.Bitmap.PixelFormat.RGBA}

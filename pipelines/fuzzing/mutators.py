@@ -12,11 +12,58 @@ from typing import Any
 import numpy as np
 
 #: Numbers that programs stumble over.
-NUMBERS = (0, -1, 1, 2, 255, 256, 65535, 65536, 2**31 - 1, 2**31, 2**32 - 1, 2**63, -2**63, 10**40, 10**400,
-           0.5, -0.0, 1e-40, 1e-300, 1e38, 1e300, math.nan, math.inf, -math.inf)
+NUMBERS = (
+    0,
+    -1,
+    1,
+    2,
+    255,
+    256,
+    65535,
+    65536,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**63,
+    -(2**63),
+    10**40,
+    10**400,
+    0.5,
+    -0.0,
+    1e-40,
+    1e-300,
+    1e38,
+    1e300,
+    math.nan,
+    math.inf,
+    -math.inf,
+)
 #: Texts that are no names, or names of something else.
-TEXTS = ("", " ", "/", ".", "..", "../../x", "/etc/passwd", "C:\\x\\y.png", "a\0b", "a\nb", "$spp", "<a>&\"'",
-         "ä", "\ud800", "x" * 300, "x" * 70000, "nan", "1e400", "--help", "%s%n", "con", "images", "true")
+TEXTS = (
+    "",
+    " ",
+    "/",
+    ".",
+    "..",
+    "../../x",
+    "/etc/passwd",
+    "C:\\x\\y.png",
+    "a\0b",
+    "a\nb",
+    "$spp",
+    "<a>&\"'",
+    "ä",
+    "\ud800",
+    "x" * 300,
+    "x" * 70000,
+    "nan",
+    "1e400",
+    "--help",
+    "%s%n",
+    "con",
+    "images",
+    "true",
+)
 
 _NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 
@@ -35,17 +82,25 @@ def damaged_bytes(data: bytes, random: Random) -> bytes:
         elif kind == 1:
             del data[at:]
         elif kind == 2:
-            del data[at:at + length]
+            del data[at : at + length]
         elif kind == 3:
-            data[at:at] = data[at:at + length] * random.choice((1, 1, 50))
+            data[at:at] = data[at : at + length] * random.choice((1, 1, 50))
         elif kind == 4:
-            data[at:at + length] = random.randbytes(length)
+            data[at : at + length] = random.randbytes(length)
         elif kind == 5:
-            data[at:at + 4] = random.choice((b"\0\0\0\0", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f",
-                                             b"\0\0\xc0\x7f", b"\0\0\x80\x7f", b"\1\0\0\0"))
+            data[at : at + 4] = random.choice(
+                (
+                    b"\0\0\0\0",
+                    b"\xff\xff\xff\xff",
+                    b"\xff\xff\xff\x7f",
+                    b"\0\0\xc0\x7f",
+                    b"\0\0\x80\x7f",
+                    b"\1\0\0\0",
+                )
+            )
         else:
             there = random.randrange(len(data))
-            data[at:at + length] = data[there:there + length]
+            data[at : at + length] = data[there : there + length]
     return bytes(data)
 
 
@@ -56,17 +111,17 @@ def damaged_text(data: bytes, random: Random) -> bytes:
     if kind <= 1 and numbers:
         found = random.choice(numbers)
         number = random.choice((*map(str, NUMBERS), "9" * 5000))
-        return data[:found.start()] + number.encode() + data[found.end():]
+        return data[: found.start()] + number.encode() + data[found.end() :]
     if kind == 2:
         words = list(re.finditer(rb"[^\s\"'<>=,]+", data))
         if words:
             found = random.choice(words)
             text = random.choice(TEXTS).encode(errors="surrogatepass")
-            return data[:found.start()] + text + data[found.end():]
+            return data[: found.start()] + text + data[found.end() :]
     lines = data.splitlines(keepends=True)
     if kind == 3 and lines:
         at = random.randrange(len(lines))
-        lines[at:at + 1] = random.choice(([], [lines[at]] * 2, [lines[at]] * 2000, [random.choice(lines)]))
+        lines[at : at + 1] = random.choice(([], [lines[at]] * 2, [lines[at]] * 2000, [random.choice(lines)]))
         return b"".join(lines)
     return damaged_bytes(data, random)
 
@@ -79,14 +134,14 @@ def damaged_xml(data: bytes, random: Random) -> bytes:
     if kind == 0 and elements:
         found, depth = random.choice(elements), random.choice((1, 50, 150, 20000))
         nested = b"<bsdf>" * depth + found.group() + b"</bsdf>" * depth
-        return data[:found.start()] + nested + data[found.end():]
+        return data[: found.start()] + nested + data[found.end() :]
     if kind == 1 and values:
         found, value = random.choice(values), random.choice((*TEXTS, *map(str, NUMBERS)))
         value = value.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
-        return data[:found.start()] + f'"{value}"'.encode(errors="surrogatepass") + data[found.end():]
+        return data[: found.start()] + f'"{value}"'.encode(errors="surrogatepass") + data[found.end() :]
     if kind == 2 and elements:
         first, second = random.choice(elements), random.choice(elements)
-        return data[:first.start()] + second.group() + data[first.end():]
+        return data[: first.start()] + second.group() + data[first.end() :]
     return damaged_text(data, random)
 
 
@@ -104,7 +159,7 @@ def damaged_json(data: bytes, random: Random) -> bytes:
             else:
                 holder[key] = _any_value(random, holder[key])
         except (IndexError, KeyError):
-            continue    # an earlier change has dropped it
+            continue  # an earlier change has dropped it
     try:
         return json.dumps(document).encode()
     except (RecursionError, ValueError):
@@ -144,7 +199,7 @@ def _any_value(random: Random, old: Any) -> Any:
 def damaged_array(array: np.ndarray, random: Random) -> np.ndarray:
     """Values, shape or type exchanged."""
     array = array.copy()
-    if array.dtype.kind == "U":    # a document in JSON
+    if array.dtype.kind == "U":  # a document in JSON
         return np.array(damaged_json(str(array).encode(), random).decode(errors="replace"))
     kind = random.randrange(6)
     if kind <= 2 and array.size and array.dtype.kind == "f":
@@ -154,10 +209,19 @@ def damaged_array(array: np.ndarray, random: Random) -> np.ndarray:
             flat[random.randrange(flat.size)] = value
         return flat.reshape(array.shape)
     if kind == 3:
-        return array[:random.randrange(len(array) + 1)] if array.ndim else array[None]
+        return array[: random.randrange(len(array) + 1)] if array.ndim else array[None]
     if kind == 4:
-        return random.choice((array.astype(np.float16), array.astype("U8"), array.ravel(), array[None],
-                              np.zeros((0, 3)), np.zeros(array.shape, bool), array.astype(np.complex64)))
+        return random.choice(
+            (
+                array.astype(np.float16),
+                array.astype("U8"),
+                array.ravel(),
+                array[None],
+                np.zeros((0, 3)),
+                np.zeros(array.shape, bool),
+                array.astype(np.complex64),
+            )
+        )
     return array.astype(np.float64) * random.choice((0.0, -1.0, 1e-30, 1e30))
 
 

@@ -29,8 +29,14 @@ class Target:
         damage: how a file is damaged.
     """
 
-    def __init__(self, write: Callable[[Path], object], attempt: Callable[[Path], object], *files: str,
-                 keeps: str | None = None, damage: Callable[[Path, Random], None] = damage_file):
+    def __init__(
+        self,
+        write: Callable[[Path], object],
+        attempt: Callable[[Path], object],
+        *files: str,
+        keeps: str | None = None,
+        damage: Callable[[Path, Random], None] = damage_file,
+    ):
         self._write, self._attempt, self._files = write, attempt, files
         self._keeps, self._damage = keeps, damage
 
@@ -96,5 +102,3 @@ def command(main: Callable[[list[str]], int], *arguments: object) -> None:
         raise UserError(told.getvalue())
     if code != 0:
         raise Broken(f"exit code {code}: {told.getvalue()}")
-
-

@@ -109,8 +109,10 @@ def _images(folder: Path) -> None:
         (inside / f"r_{number}.png").unlink()
         rgba, path = camera.render().astype(np.float32), inside / f"r_{number}.{kind}"
         if kind == "exr":
-            header = {"compression": OpenEXR.ZIP_COMPRESSION if number < 3 else OpenEXR.PIZ_COMPRESSION,
-                      "type": OpenEXR.scanlineimage}
+            header = {
+                "compression": OpenEXR.ZIP_COMPRESSION if number < 3 else OpenEXR.PIZ_COMPRESSION,
+                "type": OpenEXR.scanlineimage,
+            }
             channels = {name: np.ascontiguousarray(rgba[..., i]) for i, name in enumerate("RGBA")}
             OpenEXR.File(header, channels).write(str(path))
         elif kind == "tif":
@@ -213,25 +215,53 @@ TARGETS = {
     "mitsuba": _imported(_capture("write_mitsuba"), "*.xml", "*.exr"),
     "images": _imported(_images, "*.png", "*.exr", "*.tif", "*.webp"),
     "scene": Target(_scene, _load_scene, "bowl.xml", "*.exr"),
-    **{f"mesh_{suffix}": Target(_mesh(suffix), _convert, "mesh.*")
-       for suffix in ("ply", "obj", "stl", "glb", "off")},
+    **{
+        f"mesh_{suffix}": Target(_mesh(suffix), _convert, "mesh.*")
+        for suffix in ("ply", "obj", "stl", "glb", "off")
+    },
     "closed_mesh": Target(_mesh("ply", open_at=9.0), _convert, "mesh.*"),
     "scores": Target(_mesh("ply"), _score, "mesh.*"),
     "masks": _imported(_ignoring, "masks/*.png", "ignore/*.png"),
     "known": Target(_known, _load_scene, "*.known.exr", "*.depth.exr"),
-    **{f"video_{suffix}": Target(_video(suffix), _cut, "clip.*", keeps="out.work")
-       for suffix in ("mp4", "avi", "mkv")},
+    **{
+        f"video_{suffix}": Target(_video(suffix), _cut, "clip.*", keeps="out.work")
+        for suffix in ("mp4", "avi", "mkv")
+    },
     "turntable": Target(write_fit_with_targets, film, "mesh.ply", "scene.xml", "light.exr"),
-    "compare": Target(write_fit_with_targets, compare, "mesh.ply", "template.ply", "scene.xml", "light.exr",
-                      "view_*.exr", keeps="out_errors"),
+    "compare": Target(
+        write_fit_with_targets,
+        compare,
+        "mesh.ply",
+        "template.ply",
+        "scene.xml",
+        "light.exr",
+        "view_*.exr",
+        keeps="out_errors",
+    ),
     "export": Target(write_fit_to_export, export, "mesh.ply", "scene.xml", "light.exr"),
-    "report": Target(write_reported_fit, report, "metrics.json", "log.jsonl", "scene.xml", "light.exr",
-                     "mesh.glb", "mesh.ply", "view_*.png"),
+    "report": Target(
+        write_reported_fit,
+        report,
+        "metrics.json",
+        "log.jsonl",
+        "scene.xml",
+        "light.exr",
+        "mesh.glb",
+        "mesh.ply",
+        "view_*.png",
+    ),
     "fields": Target(_fields, _extract, "*.npz"),
     "block_fields": Target(_block_fields, _extract, "*.npz"),
     "checkpoint": Target(write_checkpoint, load_checkpoint, "*.npz"),
-    "resume": Target(write_started_fit, resume, "out/checkpoint.npz", "out/log.jsonl", "out/gshell_mi.json",
-                     keeps="out/", damage=damage_state),
+    "resume": Target(
+        write_started_fit,
+        resume,
+        "out/checkpoint.npz",
+        "out/log.jsonl",
+        "out/gshell_mi.json",
+        keeps="out/",
+        damage=damage_state,
+    ),
     "views": Target(write_views_in_doubt, judge_views, "view_*.exr", damage=damage_pixels),
     "light": Target(_map, _light, "map.*"),
 }

@@ -24,6 +24,17 @@ def sensor(pose: np.ndarray, fov: float, size: int) -> mi.Sensor:
     """The square perspective sensor of a pose; ``fov`` in degrees, ``size`` in pixels."""
     # Mitsuba's camera has x to the left and looks along +z.
     to_world = mi.ScalarTransform4f(pose @ np.diag([-1, 1, -1, 1]))
-    return mi.load_dict({"type": "perspective", "fov": fov, "to_world": to_world,
-                         "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba",
-                                  "rfilter": {"type": "gaussian"}}})
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": fov,
+            "to_world": to_world,
+            "film": {
+                "type": "hdrfilm",
+                "width": size,
+                "height": size,
+                "pixel_format": "rgba",
+                "rfilter": {"type": "gaussian"},
+            },
+        }
+    )

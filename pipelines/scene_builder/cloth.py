@@ -75,8 +75,10 @@ def drape(
             x[j] -= push
         if step % 10 == 0:
             near = cKDTree(x).query_pairs(1.5 * thickness, output_type="ndarray")
-            near = near[np.linalg.norm(rest_positions[near[:, 0]] - rest_positions[near[:, 1]], axis=1)
-                        > 2.5 * thickness]
+            near = near[
+                np.linalg.norm(rest_positions[near[:, 0]] - rest_positions[near[:, 1]], axis=1)
+                > 2.5 * thickness
+            ]
         if len(near):
             i, j = near.T
             d = x[i] - x[j]

@@ -110,8 +110,9 @@ def wrong_mask(coverage: np.ndarray, waver: float, erosion: float, rng: np.rando
     if not (waver or erosion) or inside.all() or not inside.any():
         return coverage
     # To the outline, which runs between pixels.
-    within = np.where(inside, ndimage.distance_transform_edt(inside) - 0.5,
-                      0.5 - ndimage.distance_transform_edt(~inside))
+    within = np.where(
+        inside, ndimage.distance_transform_edt(inside) - 0.5, 0.5 - ndimage.distance_transform_edt(~inside)
+    )
     return (within + waver * _smooth_noise(coverage.shape, _WAVER, rng) > erosion).astype(float)
 
 
@@ -121,8 +122,9 @@ def is_level(pose: np.ndarray) -> bool:
     return abs(place[1]) < math.sin(math.radians(LEVEL_DEGREES)) * np.linalg.norm(place)
 
 
-def behind_stand(linear: np.ndarray, coverage: np.ndarray,
-                 hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def behind_stand(
+    linear: np.ndarray, coverage: np.ndarray, hidden: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The image (h, w, 3) and the coverage (h, w) with a stand before the share ``hidden`` (h, w) of each
     pixel."""
     share = hidden[..., None]

@@ -99,17 +99,22 @@ def write_scene(name: str, item: SceneObject, folder: Path) -> None:
 
     (inside / "sensors.xml").write_text(scene_xml(*sensors("view", around(item.views))))
     (inside / "test.xml").write_text(test_xml(distance, item.lowest_view))
-    (folder / f"{name}.xml").write_text(scene_xml(
-        f"""    <!-- The unknown: fills the cube [-1, 1]^3. -->
+    (folder / f"{name}.xml").write_text(
+        scene_xml(
+            f"""    <!-- The unknown: fills the cube [-1, 1]^3. -->
     <shape type="gshell" id="subject">
         <integer name="resolution" value="{item.resolution}"/>
     </shape>
     <!-- The light that the fit starts from. -->
     <emitter type="constant" id="light"> <rgb name="radiance" value="0.5"/> </emitter>
     <include filename="{name}/sensors.xml"/>
-""", spp=16))
-    (inside / "reference.xml").write_text(reference_xml(
-        item.roughness, item.metallic, '    <include filename="sensors.xml"/>\n'))
+""",
+            spp=16,
+        )
+    )
+    (inside / "reference.xml").write_text(
+        reference_xml(item.roughness, item.metallic, '    <include filename="sensors.xml"/>\n')
+    )
     write_ply(inside / "truth.ply", vertices, item.mesh.faces, item.color)
     light = mi.Bitmap(np.ascontiguousarray(item.light, dtype=np.float32))
     light.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float16, False).write(str(inside / "light.exr"))
@@ -133,7 +138,10 @@ def reference_xml(roughness: float, metallic: float, *parts: str) -> str:
         </bsdf> </bsdf>
     </shape>
     <emitter type="envmap" id="light"> <string name="filename" value="light.exr"/> </emitter>
-""", *parts, spp=256)
+""",
+        *parts,
+        spp=256,
+    )
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, color: np.ndarray) -> None:

@@ -48,8 +48,10 @@ def load_subject(reference: Path) -> Subject:
     scene = load_scene(Path(reference))
     values = mi.traverse(scene)
     if len(scene.shapes()) != 1 or "subject.vertex_positions" not in values:
-        raise UserError(f"'{reference}' has no mesh 'subject', or other shapes beside it; give the "
-                        f"reference.xml of one of the scenes in scenes/.")
+        raise UserError(
+            f"'{reference}' has no mesh 'subject', or other shapes beside it; give the "
+            f"reference.xml of one of the scenes in scenes/."
+        )
     vertices = np.array(values["subject.vertex_positions"], float).reshape(-1, 3)
     color = np.full_like(vertices, 0.5)
     if "subject.vertex_color" in values:
@@ -59,8 +61,13 @@ def load_subject(reference: Path) -> Subject:
         found = [key for key in values.keys() if key.endswith(f".{name}.value")]
         return float(np.ravel(values[found[0]])[0]) if found else default
 
-    return Subject(vertices, np.array(values["subject.faces"]).reshape(-1, 3), color,
-                   uniform("roughness", 0.8), uniform("metallic", 0.0))
+    return Subject(
+        vertices,
+        np.array(values["subject.faces"]).reshape(-1, 3),
+        color,
+        uniform("roughness", 0.8),
+        uniform("metallic", 0.0),
+    )
 
 
 def finished(subject: Subject, faults: Faults, dice: Dice) -> Subject:
@@ -69,8 +76,9 @@ def finished(subject: Subject, faults: Faults, dice: Dice) -> Subject:
     if faults.relief or faults.print:
         limit = RELIEF_PERIOD * subject.extent / _EDGES
         while np.median(_edge_lengths(vertices, faces)) > limit:
-            vertices, faces, attributes = trimesh.remesh.subdivide(vertices, faces,
-                                                                   vertex_attributes={"color": color})
+            vertices, faces, attributes = trimesh.remesh.subdivide(
+                vertices, faces, vertex_attributes={"color": color}
+            )
             color = attributes["color"]
     unit = vertices / subject.extent
     if faults.print:

@@ -60,10 +60,15 @@ def sunny_sky(
     """
     sun = direction(azimuth, elevation)
     to_z_up = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-    sky = mi.load_dict({
-        "type": "sunsky", "sun_direction": [float(x) for x in to_z_up @ sun],
-        "turbidity": turbidity, "albedo": 0.25, "sun_scale": 0.0,
-    })
+    sky = mi.load_dict(
+        {
+            "type": "sunsky",
+            "sun_direction": [float(x) for x in to_z_up @ sun],
+            "turbidity": turbidity,
+            "albedo": 0.25,
+            "sun_scale": 0.0,
+        }
+    )
     d = directions().reshape(-1, 3)
     si = mi.SurfaceInteraction3f()
     si.wi = -mi.Vector3f(np.ascontiguousarray((d @ to_z_up.T).T, dtype=np.float32))

@@ -108,12 +108,14 @@ def cut(mesh: trimesh.Trimesh, nu: np.ndarray, *, islands: bool = False) -> trim
     ab, ac = len(v) + index.reshape(2, -1)
     a, b, c = tri.T
     one = inside[a]
-    faces = np.concatenate([
-        f[count == 3],
-        np.stack([a, ab, ac], 1)[one],
-        np.stack([ab, b, c], 1)[~one],
-        np.stack([ab, c, ac], 1)[~one],
-    ])
+    faces = np.concatenate(
+        [
+            f[count == 3],
+            np.stack([a, ab, ac], 1)[one],
+            np.stack([ab, b, c], 1)[~one],
+            np.stack([ab, c, ac], 1)[~one],
+        ]
+    )
     part = trimesh.Trimesh(np.concatenate([v, new]), faces, process=True)
     # Where the cut runs through a vertex, triangles have shrunk to points and lines.
     part.update_faces(part.nondegenerate_faces())

@@ -23,15 +23,7 @@ from gshell_mi.scene_files import load_scene
 from . import faults as wrong
 from .cameras import TO_Z_UP, look_at, sensor
 from .faults import Dice, Faults
-from .files import (
-    FOV,
-    HALF_EXTENT,
-    fibonacci_sphere,
-    reference_xml,
-    test_xml,
-    whole_view_distance,
-    write_ply,
-)
+from .files import FOV, HALF_EXTENT, fibonacci_sphere, reference_xml, test_xml, whole_view_distance, write_ply
 from .finish import finished, load_subject
 
 #: Degrees that the camera's picture spans.
@@ -72,8 +64,9 @@ class View:
     close_up: bool
 
 
-def write_photographs(what: Photographs, folder: Path,
-                      progress: Callable[[int, int], None] | None = None) -> None:
+def write_photographs(
+    what: Photographs, folder: Path, progress: Callable[[int, int], None] | None = None
+) -> None:
     """Writes ``capture/`` and ``truth/`` into a new folder, which is there when all of it is.
 
     ``capture`` is a NeRF-style capture: ``transforms.json`` (camera-to-world, z up), ``images/`` and
@@ -88,13 +81,15 @@ def write_photographs(what: Photographs, folder: Path,
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"'{folder}' exists already; name a new folder.")
     if what.views < 4 or what.size < 16 or what.spp < 1 or what.seed < 0:
-        raise UserError("A capture takes at least 4 views of 16 pixels, 1 sample per pixel and a seed "
-                        "of 0 or more.")
+        raise UserError(
+            "A capture takes at least 4 views of 16 pixels, 1 sample per pixel and a seed of 0 or more."
+        )
     subject = load_subject(what.reference)
     light = Path(what.reference).with_name("light.exr")
     if not light.is_file():
-        raise UserError(f"'{light}' does not exist; the light of the photographs belongs beside the "
-                        f"reference.xml.")
+        raise UserError(
+            f"'{light}' does not exist; the light of the photographs belongs beside the reference.xml."
+        )
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as partial:
         truth = Path(partial) / "whole" / "truth"
@@ -148,8 +143,14 @@ def seen(scene: mi.Scene, camera: mi.Sensor, size: int, height: float) -> tuple[
     return share(valid), share(low)
 
 
-def _write_capture(what: Photographs, folder: Path, truth: Path, vertices: np.ndarray, dice: Dice,
-                   progress: Callable[[int, int], None] | None) -> None:
+def _write_capture(
+    what: Photographs,
+    folder: Path,
+    truth: Path,
+    vertices: np.ndarray,
+    dice: Dice,
+    progress: Callable[[int, int], None] | None,
+) -> None:
     (folder / "images").mkdir(parents=True)
     (folder / "masks").mkdir()
     faults, scene = what.faults, load_scene(truth / "reference.xml")
@@ -173,18 +174,37 @@ def _write_capture(what: Photographs, folder: Path, truth: Path, vertices: np.nd
         options = {"quality": faults.jpeg, "subsampling": 0} if faults.jpeg else {}
         Image.fromarray(_bytes(encoded)).save(folder / image, **options)
         Image.fromarray(_bytes(mask)).save(folder / "masks" / f"{index:03}.png")
-        frames.append({"file_path": image, "mask_path": f"masks/{index:03}.png",
-                       "transform_matrix": (TO_Z_UP @ pose).tolist()})
-        facts.append({"file_path": image, "transform_matrix": (TO_Z_UP @ view.pose).tolist(),
-                      "exposure_stops": stops, "white_balance": balance.tolist(), "close_up": view.close_up})
+        frames.append(
+            {
+                "file_path": image,
+                "mask_path": f"masks/{index:03}.png",
+                "transform_matrix": (TO_Z_UP @ pose).tolist(),
+            }
+        )
+        facts.append(
+            {
+                "file_path": image,
+                "transform_matrix": (TO_Z_UP @ view.pose).tolist(),
+                "exposure_stops": stops,
+                "white_balance": balance.tolist(),
+                "close_up": view.close_up,
+            }
+        )
         if progress:
             progress(index + 1, len(views))
     focal = what.size / 2 / math.tan(math.radians(CAMERA_FOV) / 2)
-    intrinsics = {"w": what.size, "h": what.size, "fl_x": focal, "fl_y": focal, "cx": what.size / 2,
-                  "cy": what.size / 2}
+    intrinsics = {
+        "w": what.size,
+        "h": what.size,
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": what.size / 2,
+        "cy": what.size / 2,
+    }
     _write_json(folder / "transforms.json", intrinsics | {"frames": frames})
-    _write_json(truth / "faults.json",
-                {"sizes": dataclasses.asdict(faults), "seed": what.seed, "frames": facts})
+    _write_json(
+        truth / "faults.json", {"sizes": dataclasses.asdict(faults), "seed": what.seed, "frames": facts}
+    )
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

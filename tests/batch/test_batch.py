@@ -26,26 +26,34 @@ def wrong(name):
 
 
 def test_lines_become_jobs(tmp_path):
-    jobs = read_jobs(write_jobs(tmp_path / "jobs", {"command": "fit", "arguments": ["a.xml"], "cpus": 2},
-                                {"name": "b", "command": "export", "arguments": ["{out}/x"], "gpus": 0.5}))
+    jobs = read_jobs(
+        write_jobs(
+            tmp_path / "jobs",
+            {"command": "fit", "arguments": ["a.xml"], "cpus": 2},
+            {"name": "b", "command": "export", "arguments": ["{out}/x"], "gpus": 0.5},
+        )
+    )
     assert jobs[0] == Job("000001-fit", "fit", ("a.xml",), cpus=2.0)
     assert jobs[0].filled_in("/o") == ["a.xml", "-o", "/o"]
     assert jobs[1].filled_in("/o") == ["/o/x"] and jobs[1].gpus == 0.5
     assert Job("c", "report", ("fit",)).filled_in("/o") == ["fit"]  # it has no -o
 
 
-@pytest.mark.parametrize(("line", "sentence"), [
-    ("nonsense", r"line 1, is no JSON"),
-    ("[1]", "line 1, is no JSON object"),
-    ('{"command": "rm"}', "has no command of gshell_mi; choose one of capture, fit"),
-    ('{"command": "fit", "shell": "x"}', "has 'shell', which means nothing"),
-    ('{"command": "fit", "arguments": "x"}', "'arguments' must be a list of texts"),
-    ('{"command": "fit", "name": "../x"}', "the name has a '/'"),
-    ('{"command": "fit", "name": 3}', "the name is no text"),
-    ('{"command": "fit", "cpus": -1}', "'cpus' must be a number that is not negative"),
-    ("", "holds no jobs"),
-    ('{"command": "fit", "name": "a"}\n{"command": "fit", "name": "a"}', "two jobs of the name 'a'"),
-])
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("nonsense", r"line 1, is no JSON"),
+        ("[1]", "line 1, is no JSON object"),
+        ('{"command": "rm"}', "has no command of gshell_mi; choose one of capture, fit"),
+        ('{"command": "fit", "shell": "x"}', "has 'shell', which means nothing"),
+        ('{"command": "fit", "arguments": "x"}', "'arguments' must be a list of texts"),
+        ('{"command": "fit", "name": "../x"}', "the name has a '/'"),
+        ('{"command": "fit", "name": 3}', "the name is no text"),
+        ('{"command": "fit", "cpus": -1}', "'cpus' must be a number that is not negative"),
+        ("", "holds no jobs"),
+        ('{"command": "fit", "name": "a"}\n{"command": "fit", "name": "a"}', "two jobs of the name 'a'"),
+    ],
+)
 def test_mistakes_in_the_file_are_told(line, sentence, tmp_path):
     (tmp_path / "jobs").write_text(line)
     with pytest.raises(UserError, match=sentence):
@@ -73,9 +81,11 @@ def test_results_go_to_any_storage_and_only_good_ends_count(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its parent's end")
 def test_a_killed_worker_leaves_no_job_behind():
-    script = ("import subprocess\nfrom gshell_mi.lifetime import end_with_parent\n"
-              "job = subprocess.Popen(['sleep', '600'], preexec_fn=end_with_parent)\n"
-              "print(job.pid, flush=True)\njob.wait()\n")
+    script = (
+        "import subprocess\nfrom gshell_mi.lifetime import end_with_parent\n"
+        "job = subprocess.Popen(['sleep', '600'], preexec_fn=end_with_parent)\n"
+        "print(job.pid, flush=True)\njob.wait()\n"
+    )
     worker = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
     job = int(worker.stdout.readline())
     assert _runs(job)
@@ -143,7 +153,12 @@ def test_lost_workers_cost_a_try_and_mistakes_none_and_neither_stops_the_rest(tm
     with pytest.raises(UserError, match="2 jobs of 5 failed, first 'bad'; see"):
         run_batch(jobs, tmp_path / "out", retries=2)
     assert {name: ray.runs.count(name) for name in ("a", "b", "bad", "never", "c")} == {
-        "a": 1, "b": 2, "bad": 1, "never": 3, "c": 1}
+        "a": 1,
+        "b": 2,
+        "bad": 1,
+        "never": 3,
+        "c": 1,
+    }
     rows = [json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()]
     assert [row["name"] for row in rows] == ["bad", "never", "a", "b", "c"]  # the worst first
     page = (tmp_path / "out" / "results.html").read_text()
@@ -156,12 +171,15 @@ def test_without_ray_it_is_told(tmp_path, monkeypatch, capsys):
     assert "This needs Ray; install it with pip install 'gshell_mi[ray]'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("arguments", "sentence"), [
-    (["{tmp}/no", "-o", "{tmp}/out"], "does not exist; check the path"),
-    (["{tmp}/jobs"], "Nothing says where the results go"),
-    (["{tmp}/jobs", "-o", "{tmp}/out", "--retries", "-1"], "--retries must not be negative"),
-    (["{tmp}/jobs", "-o", "{tmp}/out", "--cpus", "0"], "--cpus must be at least 1"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["{tmp}/no", "-o", "{tmp}/out"], "does not exist; check the path"),
+        (["{tmp}/jobs"], "Nothing says where the results go"),
+        (["{tmp}/jobs", "-o", "{tmp}/out", "--retries", "-1"], "--retries must not be negative"),
+        (["{tmp}/jobs", "-o", "{tmp}/out", "--cpus", "0"], "--cpus must be at least 1"),
+    ],
+)
 def test_mistakes_are_told(arguments, sentence, tmp_path, capsys):
     write_jobs(tmp_path / "jobs", wrong("a"))
     assert main([argument.replace("{tmp}", str(tmp_path)) for argument in arguments]) == 2
@@ -176,8 +194,23 @@ def test_on_a_cluster_of_this_machine_what_is_done_is_not_done_again(tmp_path):
 
     (tmp_path / "in").mkdir()
     trimesh.creation.icosphere().export(tmp_path / "in" / "ball.ply")
-    made = [{"name": f"set{i}", "command": "dataset", "arguments": [str(tmp_path / "in"), "--side", "16",
-             "--max-chamfer", "5", "--quiet", "-o", "{out}"]} for i in range(2)]
+    made = [
+        {
+            "name": f"set{i}",
+            "command": "dataset",
+            "arguments": [
+                str(tmp_path / "in"),
+                "--side",
+                "16",
+                "--max-chamfer",
+                "5",
+                "--quiet",
+                "-o",
+                "{out}",
+            ],
+        }
+        for i in range(2)
+    ]
     jobs = write_jobs(tmp_path / "jobs", *made, wrong("bad"))
     shards = [tmp_path / "out" / "jobs" / f"set{i}" / "out" / "shards" / "00000.npz" for i in range(2)]
     times = []

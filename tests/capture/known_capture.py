@@ -49,7 +49,7 @@ class KnownCamera:
     def render(self, distorted: bool = True, samples: int = 4) -> np.ndarray:
         """(h, w, 4) linear premultiplied: pixels are averages over samples x samples points."""
         n = samples
-        v, u = (np.mgrid[:self.height * n, :self.width * n] + 0.5) / n
+        v, u = (np.mgrid[: self.height * n, : self.width * n] + 0.5) / n
         q = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy], axis=-1)
         q = undistort(q, **self.lens) if distorted and self.lens else q
         d = self.forward + q[..., :1] * self.right - q[..., 1:] * self.up
@@ -68,13 +68,15 @@ def distort(q, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0):
     x, y = q[..., 0], q[..., 1]
     r = np.sqrt(x**2 + y**2)
     f = 1 + k1 * r**2 + k2 * r**4 + k3 * r**6 + k4 * r**8
-    return np.stack([x * f + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
-                     y * f + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y], axis=-1)
+    return np.stack(
+        [x * f + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2), y * f + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y],
+        axis=-1,
+    )
 
 
 def undistort(q, **lens):
     ideal = q.copy()
-    for _ in range(60):    # converges for lenses as mild as these
+    for _ in range(60):  # converges for lenses as mild as these
         ideal += q - distort(ideal, **lens)
     assert np.abs(distort(ideal, **lens) - q).max() < 1e-9
     return ideal
@@ -108,8 +110,9 @@ def points(count=200) -> np.ndarray:
 
 
 def encoded(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear <= 0.0031308, 12.92 * linear,
-                    1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    )
 
 
 def straight_png(rgba: np.ndarray) -> np.ndarray:
@@ -140,8 +143,10 @@ def write_nerf(folder: Path, cameras: list[KnownCamera], flavour: str = "blender
         matrix[:3] = np.stack([c.right, c.up, -c.forward, c.origin], axis=1)
         name = f"train/r_{k}" if flavour == "blender" else f"images/frame_{k:05}.png"
         write_image(folder / (name + (".png" if flavour == "blender" else "")), c)
-        frame = {"file_path": "./" + name if flavour == "blender" else name,
-                 "transform_matrix": matrix.tolist()}
+        frame = {
+            "file_path": "./" + name if flavour == "blender" else name,
+            "transform_matrix": matrix.tolist(),
+        }
         if flavour == "nerfstudio":
             frame |= _intrinsics(c)
         frames.append(frame)
@@ -161,8 +166,9 @@ def _intrinsics(c: KnownCamera) -> dict:
     return {"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "w": c.width, "h": c.height, **c.lens}
 
 
-def write_colmap(folder: Path, cameras: list[KnownCamera], model: str = "PINHOLE",
-                 binary: bool = True) -> Path:
+def write_colmap(
+    folder: Path, cameras: list[KnownCamera], model: str = "PINHOLE", binary: bool = True
+) -> Path:
     """sparse/0, images/ and masks/; a camera per image, numbered out of order."""
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
@@ -174,9 +180,13 @@ def write_colmap(folder: Path, cameras: list[KnownCamera], model: str = "PINHOLE
         x, y, z, w = Rotation.from_matrix(to_camera).as_quat()
         lens = [c.lens.get(key, 0.0) for key in ("k1", "k2", "p1", "p2")]
         shared = [c.fx, c.cx, c.cy]
-        parameters = {"SIMPLE_PINHOLE": shared, "PINHOLE": [c.fx, c.fy, c.cx, c.cy],
-                      "SIMPLE_RADIAL": [*shared, lens[0]], "RADIAL": [*shared, *lens[:2]],
-                      "OPENCV": [c.fx, c.fy, c.cx, c.cy, *lens]}[model]
+        parameters = {
+            "SIMPLE_PINHOLE": shared,
+            "PINHOLE": [c.fx, c.fy, c.cx, c.cy],
+            "SIMPLE_RADIAL": [*shared, lens[0]],
+            "RADIAL": [*shared, *lens[:2]],
+            "OPENCV": [c.fx, c.fy, c.cx, c.cy, *lens],
+        }[model]
         entries.append((100 - k, c, parameters, [w, x, y, z, *(-to_camera @ c.origin)], name))
     if binary:
         number = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"].index(model)
@@ -190,11 +200,16 @@ def write_colmap(folder: Path, cameras: list[KnownCamera], model: str = "PINHOLE
             data += struct.pack("<Q", 2) + struct.pack("<ddqddq", 1.5, 2.5, -1, 3.5, 4.5, 8)
         (sparse / "images.bin").write_bytes(data)
     else:
-        text = "".join(f"{i} {model} {c.width} {c.height} {' '.join(map(repr, map(float, p)))}\n"
-                       for i, c, p, _, _ in entries)
+        text = "".join(
+            f"{i} {model} {c.width} {c.height} {' '.join(map(repr, map(float, p)))}\n"
+            for i, c, p, _, _ in entries
+        )
         (sparse / "cameras.txt").write_text("# Camera list\n" + text)
-        text = "".join(f"{i + 7} {' '.join(map(repr, map(float, pose)))} {i} {name}\n"
-                       + ("1.5 2.5 -1\n" if i % 2 else "\n") for i, _, _, pose, name in entries)
+        text = "".join(
+            f"{i + 7} {' '.join(map(repr, map(float, pose)))} {i} {name}\n"
+            + ("1.5 2.5 -1\n" if i % 2 else "\n")
+            for i, _, _, pose, name in entries
+        )
         (sparse / "images.txt").write_text("# Image list with two lines of data per image:\n" + text)
     return folder
 
@@ -212,8 +227,11 @@ def write_idr(folder: Path, cameras: list[KnownCamera]) -> Path:
         world[:3] = factor * intrinsic @ np.column_stack([to_camera, -to_camera @ c.origin])
         scale = np.diag([1.2 * RADIUS] * 3 + [1.0])
         scale[:3, 3] = BALL
-        arrays |= {f"world_mat_{k}": world, f"scale_mat_{k}": scale,
-                   f"world_mat_inv_{k}": np.linalg.inv(world)}
+        arrays |= {
+            f"world_mat_{k}": world,
+            f"scale_mat_{k}": scale,
+            f"world_mat_inv_{k}": np.linalg.inv(world),
+        }
     np.savez(folder / "cameras_sphere.npz", **arrays)
     return folder
 
@@ -223,8 +241,10 @@ def write_llff(folder: Path, cameras: list[KnownCamera], shrunk: int = 1) -> Pat
     rows = []
     for k, c in enumerate(cameras):
         write_image(folder / "images" / f"image{k:03}.png", c)
-        matrix = np.stack([-c.up, c.right, -c.forward, c.origin,
-                           [shrunk * c.height, shrunk * c.width, shrunk * c.fx]], axis=1)
+        matrix = np.stack(
+            [-c.up, c.right, -c.forward, c.origin, [shrunk * c.height, shrunk * c.width, shrunk * c.fx]],
+            axis=1,
+        )
         rows.append([*matrix.ravel(), 1.0, 9.0])
     np.save(folder / "poses_bounds.npy", np.array(rows))
     return folder
@@ -256,18 +276,38 @@ OFF_CENTRE = {"cx": 31.7, "cy": 20.4}
 CAPTURES = {
     "Blender": (known_cameras(), write_nerf),
     "instant-ngp": (known_cameras(**OFF_CENTRE, fy=71.5, lens=LENS), lambda f, c: write_nerf(f, c, "ngp")),
-    "nerfstudio": ([KnownCamera(c.origin, c.forward, c.up, fx=70 + k, fy=70 + k, cx=30 + k / 7, cy=22 - k / 9,
-                                lens=LENS | {"k3": 0.01, "k4": -0.01})
-                    for k, c in enumerate(known_cameras())], lambda f, c: write_nerf(f, c, "nerfstudio")),
-    **{f"COLMAP {model} {'binary' if binary else 'text'}": (
-        known_cameras(**OFF_CENTRE, **options, up=(0.1, -1, 0.2)),
-        lambda f, c, m=model, b=binary: write_colmap(f, c, m, b))
-       for binary in (True, False) for model, options in {
-           "SIMPLE_PINHOLE": {}, "PINHOLE": {"fy": 68.0}, "SIMPLE_RADIAL": {"lens": {"k1": 0.1}},
-           "RADIAL": {"lens": {"k1": -0.1, "k2": 0.05}}, "OPENCV": {"fy": 71.0, "lens": LENS}}.items()},
+    "nerfstudio": (
+        [
+            KnownCamera(
+                c.origin,
+                c.forward,
+                c.up,
+                fx=70 + k,
+                fy=70 + k,
+                cx=30 + k / 7,
+                cy=22 - k / 9,
+                lens=LENS | {"k3": 0.01, "k4": -0.01},
+            )
+            for k, c in enumerate(known_cameras())
+        ],
+        lambda f, c: write_nerf(f, c, "nerfstudio"),
+    ),
+    **{
+        f"COLMAP {model} {'binary' if binary else 'text'}": (
+            known_cameras(**OFF_CENTRE, **options, up=(0.1, -1, 0.2)),
+            lambda f, c, m=model, b=binary: write_colmap(f, c, m, b),
+        )
+        for binary in (True, False)
+        for model, options in {
+            "SIMPLE_PINHOLE": {},
+            "PINHOLE": {"fy": 68.0},
+            "SIMPLE_RADIAL": {"lens": {"k1": 0.1}},
+            "RADIAL": {"lens": {"k1": -0.1, "k2": 0.05}},
+            "OPENCV": {"fy": 71.0, "lens": LENS},
+        }.items()
+    },
     "IDR": (known_cameras(**OFF_CENTRE, fy=70.4, up=(0, -1, 0)), write_idr),
     "LLFF": (known_cameras(), write_llff),
     "LLFF of larger originals": (known_cameras(), lambda f, c: write_llff(f, c, shrunk=4)),
     "Mitsuba": (known_cameras(up=(0, 1, 0)), write_mitsuba),
 }
-

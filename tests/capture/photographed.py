@@ -17,8 +17,9 @@ def cameras(count: int, width: int = 320, height: int = 240, distance: float = 2
     result = []
     for k in range(count):
         azimuth, elevation = 2 * np.pi * k / count, np.radians(25 if k % 2 else 40)
-        direction = np.array([np.cos(elevation) * np.sin(azimuth), np.sin(elevation),
-                              np.cos(elevation) * np.cos(azimuth)])
+        direction = np.array(
+            [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+        )
         forward = -direction
         right = np.cross(forward, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
@@ -46,7 +47,7 @@ def photograph(camera: Camera, samples: int = 2, *, plain: bool = False) -> tupl
         plain: the ball has one colour, which is one of the table's.
     """
     n = samples
-    v, u = (np.mgrid[:camera.height * n, :camera.width * n] + 0.5) / n
+    v, u = (np.mgrid[: camera.height * n, : camera.width * n] + 0.5) / n
     ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
     ray = ray @ camera.to_world[:3, :3].T
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -61,8 +62,9 @@ def photograph(camera: Camera, samples: int = 2, *, plain: bool = False) -> tupl
     table = camera.center + ray * (-camera.center[1] / np.minimum(ray[..., 1], -1e-3))[..., None]
     cells = np.floor(table[..., [0, 2]] * 80).astype(int) % 512
     on_table = 0.5 + 0.15 * _TABLE[cells[..., 0], cells[..., 1]]
-    color = np.where(ball[..., None], on_ball[..., None] * [1.0, 0.5, 0.3],
-                     on_table[..., None] * [0.4, 0.6, 1.0])
+    color = np.where(
+        ball[..., None], on_ball[..., None] * [1.0, 0.5, 0.3], on_table[..., None] * [0.4, 0.6, 1.0]
+    )
     if plain:
         color[ball] = [0.2, 0.3, 0.5]
     rgba = np.concatenate([np.clip(color, 0, 1), ball[..., None]], axis=-1)

@@ -11,17 +11,51 @@ from PIL import Image
 from gshell_mi.capture import read_capture
 from gshell_mi.errors import UserError
 
-SCALARS = (st.none() | st.booleans() | st.integers(-10**400, 10**400) | st.floats() | st.text(max_size=20)
-           | st.sampled_from(["a.png", "/", "..", "a", "\\", "train_filenames"]))
-VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner, max_size=5)
-                      | st.dictionaries(st.text(max_size=8), inner, max_size=4), max_leaves=20)
-KEYS = ["w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "camera_model", "camera_angle_x", "is_fisheye",
-        "train_filenames", "val_filenames", "test_filenames"]
-FRAMES = st.lists(VALUES | st.fixed_dictionaries(
-    {}, optional={"file_path": SCALARS, "transform_matrix": VALUES | st.just(np.eye(4).tolist()),
-                  "mask_path": SCALARS, "fl_x": SCALARS, "w": SCALARS}), max_size=3)
-DOCUMENTS = VALUES | st.fixed_dictionaries({"frames": FRAMES | VALUES},
-                                           optional={key: VALUES for key in KEYS})
+SCALARS = (
+    st.none()
+    | st.booleans()
+    | st.integers(-(10**400), 10**400)
+    | st.floats()
+    | st.text(max_size=20)
+    | st.sampled_from(["a.png", "/", "..", "a", "\\", "train_filenames"])
+)
+VALUES = st.recursive(
+    SCALARS,
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=20,
+)
+KEYS = [
+    "w",
+    "h",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "k1",
+    "camera_model",
+    "camera_angle_x",
+    "is_fisheye",
+    "train_filenames",
+    "val_filenames",
+    "test_filenames",
+]
+FRAMES = st.lists(
+    VALUES
+    | st.fixed_dictionaries(
+        {},
+        optional={
+            "file_path": SCALARS,
+            "transform_matrix": VALUES | st.just(np.eye(4).tolist()),
+            "mask_path": SCALARS,
+            "fl_x": SCALARS,
+            "w": SCALARS,
+        },
+    ),
+    max_size=3,
+)
+DOCUMENTS = VALUES | st.fixed_dictionaries(
+    {"frames": FRAMES | VALUES}, optional={key: VALUES for key in KEYS}
+)
 
 
 @pytest.fixture(scope="module")

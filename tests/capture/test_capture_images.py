@@ -34,8 +34,15 @@ def test_decoding_of_srgb_is_its_inverse():
     np.testing.assert_array_equal((srgb(linear) * 255 + 0.5).astype(int)[0, :, 0], np.arange(256))
 
 
-@pytest.mark.parametrize("transfer, value, linear", [
-    ("linear", 0.5, 0.5), ("Gamma 2.2", 0.5, 0.5**2.2), ("ITU-R BT.709", 0.081, 0.018), (None, 0.5, 0.21404)])
+@pytest.mark.parametrize(
+    "transfer, value, linear",
+    [
+        ("linear", 0.5, 0.5),
+        ("Gamma 2.2", 0.5, 0.5**2.2),
+        ("ITU-R BT.709", 0.081, 0.018),
+        (None, 0.5, 0.21404),
+    ],
+)
 def test_transfer_functions(transfer, value, linear):
     deep = np.full((1, 1, 3), round(value * 65535), np.uint16)
     assert ColorDecoding(transfer=transfer).linear(deep)[0, 0, 1] == pytest.approx(linear, abs=2e-4)
@@ -46,13 +53,14 @@ def test_wide_primaries_come_out_in_rec709():
     decoding = ColorDecoding("Display P3")
     white, red = decoding.linear(np.array([[[255] * 3, [255, 0, 0]]], np.uint8))[0]
     np.testing.assert_allclose(white, 1, atol=1e-3)
-    np.testing.assert_allclose(red, [1.2249, 0, 0], atol=1e-3)    # green and blue would be negative
+    np.testing.assert_allclose(red, [1.2249, 0, 0], atol=1e-3)  # green and blue would be negative
     floats = ColorDecoding("ACEScg").linear(np.full((1, 1, 3), 0.18, np.float32))
-    np.testing.assert_allclose(floats, 0.18, atol=1e-3)    # grey stays grey, and linear stays linear
+    np.testing.assert_allclose(floats, 0.18, atol=1e-3)  # grey stays grey, and linear stays linear
 
 
-@pytest.mark.parametrize("mode, expected", [
-    ("L", 3), ("LA", 4), ("RGB", 3), ("RGBA", 4), ("1", 3), ("P", 4), ("CMYK", 3)])
+@pytest.mark.parametrize(
+    "mode, expected", [("L", 3), ("LA", 4), ("RGB", 3), ("RGBA", 4), ("1", 3), ("P", 4), ("CMYK", 3)]
+)
 def test_every_layout_becomes_rgb_or_rgba(mode, expected, tmp_path):
     path = tmp_path / ("image.jpg" if mode == "CMYK" else "image.png")
     Image.fromarray(RGBA).convert(mode).save(path)
@@ -83,8 +91,9 @@ def test_png_has_straight_and_exr_premultiplied_alpha(tmp_path):
     Image.fromarray(RGBA).save(tmp_path / "a.png")
     linear = ColorDecoding().linear(RGBA[..., :3])
     alpha = RGBA[..., 3:] / np.float32(255)
-    np.testing.assert_allclose(prepared(tmp_path / "a.png"), np.concatenate([linear * alpha, alpha], -1),
-                               atol=1e-6)
+    np.testing.assert_allclose(
+        prepared(tmp_path / "a.png"), np.concatenate([linear * alpha, alpha], -1), atol=1e-6
+    )
     floats = np.concatenate([linear * alpha, alpha], -1).astype(np.float32)
     mi.Bitmap(floats).write(str(tmp_path / "a.exr"))
     np.testing.assert_array_equal(prepared(tmp_path / "a.exr"), floats)
@@ -117,8 +126,7 @@ def test_a_mask_overrules_alpha(tmp_path):
     np.testing.assert_array_equal(result[..., :3], ColorDecoding().linear(RGBA[..., :3]))
 
 
-@pytest.mark.parametrize("names", [
-    ["a.png", "b.c.png"], ["a.jpg.png", "b.c.jpg.png"], ["A1.png", "A2.png"]])
+@pytest.mark.parametrize("names", [["a.png", "b.c.png"], ["a.jpg.png", "b.c.jpg.png"], ["A1.png", "A2.png"]])
 def test_masks_are_found_by_name_else_by_order(names, tmp_path):
     for folder, files in (("images", ["a.jpg", "b.c.jpg"]), ("masks", names)):
         (tmp_path / folder).mkdir()
@@ -134,7 +142,7 @@ def test_a_known_background_is_taken_away(tmp_path):
     green = np.array([0, 200, 0])
     image = np.tile(green, (6, 8, 1)).astype(np.uint8)
     image[:, :4] = [180, 30, 90]
-    image[:, 4] = green + 13    # half of the tolerance away
+    image[:, 4] = green + 13  # half of the tolerance away
     Image.fromarray(image).save(tmp_path / "a.png")
     rgba = prepared(tmp_path / "a.png", background=Background.parse("#00c800"))
     np.testing.assert_array_equal(rgba[:, :4, 3], 1)
@@ -166,8 +174,12 @@ def photograph(path, seconds, iso, aperture):
 
 
 def test_exif_exposures_are_evened_out(tmp_path):
-    settings = {"a": (1 / 100, 100, 2.0), "b": (1 / 25, 100, 2.0), "c": (1 / 100, 400, 2.0),
-                "d": (1 / 25, 400, 4.0)}
+    settings = {
+        "a": (1 / 100, 100, 2.0),
+        "b": (1 / 25, 100, 2.0),
+        "c": (1 / 100, 400, 2.0),
+        "d": (1 / 25, 400, 4.0),
+    }
     frames = tuple(photograph(tmp_path / f"{name}.jpg", *values) for name, values in settings.items())
     assert exif_exposure(frames[1].image) == pytest.approx(np.log2(1 / 25 / 4))
     gains = exposure_gains(Capture("test", tmp_path, frames), None)
@@ -205,7 +217,7 @@ def test_shrinking_averages_areas(size):
     assert shrunk.fx == pytest.approx(9 * scale) and shrunk.cx == pytest.approx(width / 2 * scale)
     np.testing.assert_allclose(small[..., 1], 1, rtol=1e-5)
     # The mean over a pixel of a piecewise constant image of x is exact to a fraction of an old pixel.
-    v, u = np.mgrid[0.5:shrunk.height, 0.5:shrunk.width] / scale
+    v, u = np.mgrid[0.5 : shrunk.height, 0.5 : shrunk.width] / scale
     np.testing.assert_allclose(small[..., 0], u + 2 * v, atol=0.13 / scale if longest < 39 else 0.8)
 
 

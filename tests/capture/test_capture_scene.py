@@ -91,7 +91,10 @@ def test_every_nth_view_is_held_out(source, tmp_path):
     assert (result.training, result.held_out) == (17, 3)
     record = json.loads((tmp_path / "s" / "capture.json").read_text())
     assert [view["image"].split("_")[-1] for view in record["views"] if view["id"].startswith("test")] == [
-        "0.png", "8.png", "16.png"]
+        "0.png",
+        "8.png",
+        "16.png",
+    ]
 
 
 def test_paths_with_spaces_and_other_scripts(source, tmp_path, capfd, variant):
@@ -100,10 +103,24 @@ def test_paths_with_spaces_and_other_scripts(source, tmp_path, capfd, variant):
     for number in range(3):
         (folder / "фото 1/test" / f"r_{number}.png").rename(folder / "фото 1/test" / f"é & <{number}>.png")
     path = folder / "фото 1/transforms_test.json"
-    path.write_text(path.read_text().replace("/r_0", "/é & <0>").replace("/r_1", "/é & <1>")
-                    .replace("/r_2", "/é & <2>"), encoding="utf-8")
-    assert main([str(folder / "фото 1"), "-o", str(folder / "szene ü.xml"), "--check", "--quiet",
-                 "--variant", variant]) == 0
+    path.write_text(
+        path.read_text().replace("/r_0", "/é & <0>").replace("/r_1", "/é & <1>").replace("/r_2", "/é & <2>"),
+        encoding="utf-8",
+    )
+    assert (
+        main(
+            [
+                str(folder / "фото 1"),
+                "-o",
+                str(folder / "szene ü.xml"),
+                "--check",
+                "--quiet",
+                "--variant",
+                variant,
+            ]
+        )
+        == 0
+    )
     assert "23" not in capfd.readouterr().err
     assert len(load_fit_scene(folder / "szene ü.xml").sensors) == 20
     assert (folder / "szene ü" / "check.png").is_file()
@@ -117,19 +134,21 @@ def test_given_box_light_and_resolution(source, tmp_path):
     fit_scene = load_fit_scene(import_capture(source, tmp_path / "s.xml", config=config).path)
     assert fit_scene.subject.lattice.resolution == 20
     corner = mi.Transform4f(fit_scene.subject.to_world) @ mi.Point3f(1, 1, 1)
-    np.testing.assert_allclose(np.array(corner).ravel(), [1.5, 2, 1.5])    # grown to a cube
+    np.testing.assert_allclose(np.array(corner).ravel(), [1.5, 2, 1.5])  # grown to a cube
     (tmp_path / "sky.exr").unlink()
     assert "data" in mi.traverse(load_fit_scene(tmp_path / "s.xml").light)
 
 
-@pytest.mark.parametrize("up, expected", [
-    ("auto", [0, 0, 1]), ("z", [0, 0, 1]), ("-x", [-1, 0, 0]), ("cameras", [0, 0, 1]), ("-y", [0, -1, 0])])
+@pytest.mark.parametrize(
+    "up, expected",
+    [("auto", [0, 0, 1]), ("z", [0, 0, 1]), ("-x", [-1, 0, 0]), ("cameras", [0, 0, 1]), ("-y", [0, -1, 0])],
+)
 def test_up_is_turned_to_y(up, expected, source, tmp_path):
     import_capture(source, tmp_path / "s.xml", config=CaptureConfig(up=up))
     matrix = np.array(json.loads((tmp_path / "s" / "capture.json").read_text())["capture_to_scene"])
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(matrix) == pytest.approx(1)
-    tolerance = 0.06 if up == "cameras" else 1e-12    # twenty cameras are up on average but roughly
+    tolerance = 0.06 if up == "cameras" else 1e-12  # twenty cameras are up on average but roughly
     np.testing.assert_allclose(matrix[:3, :3] @ expected, [0, 1, 0], atol=tolerance)
 
 
@@ -173,8 +192,10 @@ def test_another_colour_profile_is_noticed(source, tmp_path):
 
 
 def test_importing_the_package_sets_no_variant():
-    code = ("import mitsuba as mi, gshell_mi.capture, gshell_mi.capture.__main__, gshell_mi.capture.check; "
-            "assert mi.variant() is None")
+    code = (
+        "import mitsuba as mi, gshell_mi.capture, gshell_mi.capture.__main__, gshell_mi.capture.check; "
+        "assert mi.variant() is None"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -242,10 +263,14 @@ def test_box_that_misses_the_object():
     assert len(found) == 1 and "The box misses the object" in found[0]
 
 
-@pytest.mark.parametrize("change, words", [
-    (lambda pose: pose @ np.diag([1, -1, -1, 1]), "y and z axes point the other way"),
-    (np.linalg.inv, "world-to-camera"),
-    (lambda pose: pose @ np.diag([-1, -1, 1, 1]), "upside down")])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda pose: pose @ np.diag([1, -1, -1, 1]), "y and z axes point the other way"),
+        (np.linalg.inv, "world-to-camera"),
+        (lambda pose: pose @ np.diag([-1, -1, 1, 1]), "upside down"),
+    ],
+)
 def test_misread_cameras_are_told_apart(change, words):
     """With a box that all rays meet, so that it is not to blame."""
     views = [replace(t, camera=replace(t.camera, to_world=change(t.camera.to_world))) for t in thumbnails()]
@@ -337,5 +362,6 @@ def test_known_camera_is_what_it_says():
     camera = KnownCamera(origin, forward, up, cx=33, cy=20)
     alpha = camera.render()[..., 3]
     v, u = np.mgrid[0.5:44, 0.5:60]
-    np.testing.assert_allclose([(alpha * u).sum() / alpha.sum(), (alpha * v).sum() / alpha.sum()], [33, 20],
-                               atol=1e-6)
+    np.testing.assert_allclose(
+        [(alpha * u).sum() / alpha.sum(), (alpha * v).sum() / alpha.sum()], [33, 20], atol=1e-6
+    )

@@ -29,9 +29,25 @@ def recipe():
 def test_photographed_scene_comes_back(recipe, tmp_path, monkeypatch, variant):
     """Through PNG, z-up, shrinking and y-up: as Mitsuba renders the true scene with the written sensors."""
     reference = write_scene(tmp_path).with_suffix("") / "reference.xml"
-    monkeypatch.setattr(sys, "argv", ["make", str(reference), str(tmp_path / "set"), "--views", "6",
-                                      "--test-views", "2", "--size", "96", "--spp", "32",
-                                      "--variant", variant])
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        [
+            "make",
+            str(reference),
+            str(tmp_path / "set"),
+            "--views",
+            "6",
+            "--test-views",
+            "2",
+            "--size",
+            "96",
+            "--spp",
+            "32",
+            "--variant",
+            variant,
+        ],
+    )
     recipe.main()
     result = import_capture(tmp_path / "set", tmp_path / "imported.xml", config=CaptureConfig(max_size=32))
     assert (result.training, result.held_out) == (6, 2)

@@ -31,7 +31,7 @@ def test_an_outlines_grey_is_coverage_and_a_wide_one_is_doubt():
     expected[40:60, :30] = True
     np.testing.assert_array_equal(wide_grey(mask) & (mask == 0.5), expected)
     assert (wide_grey(mask) & ~ndimage.binary_dilation(expected, iterations=3)).sum() == 0
-    assert wide_grey(ndimage.gaussian_filter(disk(), 6)).any()    # a feathered selection
+    assert wide_grey(ndimage.gaussian_filter(disk(), 6)).any()  # a feathered selection
 
 
 @pytest.fixture
@@ -89,7 +89,6 @@ def test_what_lies_beside_the_frame_is_unknown(tmp_path):
 
 def test_nothing_is_carved_where_nothing_is_known():
 
-
     camera = Camera(100, 100, 100.0, 100.0, 50.0, 50.0, np.eye(4))
     view = Silhouette(camera, disk())
     beside = np.array([[0.42, 0.0, 1.0], [0.0, 0.0, 1.0]])
@@ -99,9 +98,16 @@ def test_nothing_is_carved_where_nothing_is_known():
     assert Carving([replace(view, known=known)]).keeps(beside, 0.0).tolist() == [True, True]
 
 
-@pytest.mark.parametrize("values, words", [
-    (np.full((4, 6), 0.5), None), (np.full((4, 5), 1.0), "5 x 4 pixels"), (np.full((4, 6), 2.0), "no shares"),
-    (np.full((4, 6), np.nan), "no shares"), (np.arange(72.0).reshape(4, 6, 3) / 72, "different channels")])
+@pytest.mark.parametrize(
+    "values, words",
+    [
+        (np.full((4, 6), 0.5), None),
+        (np.full((4, 5), 1.0), "5 x 4 pixels"),
+        (np.full((4, 6), 2.0), "no shares"),
+        (np.full((4, 6), np.nan), "no shares"),
+        (np.arange(72.0).reshape(4, 6, 3) / 72, "different channels"),
+    ],
+)
 def test_known_files_of_targets(values, words, tmp_path):
     mi.Bitmap(np.ones((4, 6, 4), np.float32)).write(str(tmp_path / "a.exr"))
     mi.Bitmap(values.astype(np.float32)).write(str(tmp_path / "a.known.exr"))

@@ -19,15 +19,28 @@ def folder(tmp_path):
     return make
 
 
-@pytest.mark.parametrize("there, named, found", [
-    ("a.png", "a.png", "a.png"), ("a.png", "a", "a.png"), ("a.PNG", "a", "a.PNG"),
-    ("a.PNG", "a.png", "a.PNG"), ("a.jpg", "a.JPG", "a.jpg"), ("a.1.png", "a.1", "a.1.png"),
-    ("A.png", "a.png", None), ("a.png", "b.png", None),
-    ("u\u0308.png", "\u00fc.png", "u\u0308.png"), ("\u00fc.JPG", "u\u0308", "\u00fc.JPG"),
-    ("fu\u0308r/e\u0301/a.png", "f\u00fcr/\u00e9/a.png", "fu\u0308r/e\u0301/a.png"),
-    ("u.png", "\u00fc.png", None), ("u/a.png", "\u00fc/a.png", None),
-    ("a.png", "a.jpg", None), ("a.png", "x" * 300, None), ("a.png", "a\0.png", None), ("a.png", "", None),
-])
+@pytest.mark.parametrize(
+    "there, named, found",
+    [
+        ("a.png", "a.png", "a.png"),
+        ("a.png", "a", "a.png"),
+        ("a.PNG", "a", "a.PNG"),
+        ("a.PNG", "a.png", "a.PNG"),
+        ("a.jpg", "a.JPG", "a.jpg"),
+        ("a.1.png", "a.1", "a.1.png"),
+        ("A.png", "a.png", None),
+        ("a.png", "b.png", None),
+        ("u\u0308.png", "\u00fc.png", "u\u0308.png"),
+        ("\u00fc.JPG", "u\u0308", "\u00fc.JPG"),
+        ("fu\u0308r/e\u0301/a.png", "f\u00fcr/\u00e9/a.png", "fu\u0308r/e\u0301/a.png"),
+        ("u.png", "\u00fc.png", None),
+        ("u/a.png", "\u00fc/a.png", None),
+        ("a.png", "a.jpg", None),
+        ("a.png", "x" * 300, None),
+        ("a.png", "a\0.png", None),
+        ("a.png", "", None),
+    ],
+)
 def test_suffixes_may_be_left_out_or_in_another_case(there, named, found, folder):
     place = folder(there)
     assert existing(place / named) == (place / found if found else None)
@@ -45,15 +58,18 @@ def test_files_that_appear_later_are_seen(folder):
     assert existing(place / "a.png") == place / "a.PNG"
 
 
-@pytest.mark.parametrize("names, there, found", [
-    (["images/a.png", "images/b.png"], ["a.png", "b.png"], ["a.png", "b.png"]),
-    (["C:\\pictures\\a.png", "/home/x/b.png"], ["a.png", "b.png"], ["a.png", "b.png"]),
-    (["images/l/0.png", "images/r/0.png"], ["l/0.png", "r/0.png"], ["l/0.png", "r/0.png"]),
-    (["images/l/0.png", "images/r/0.png"], ["0.png"], [None, None]),
-    (["images/l/0.png", "images/r/1.png"], ["0.png", "r/1.png", "1.png"], ["0.png", "r/1.png"]),
-    (["./images/a", "images/a"], ["a.JPG"], ["a.JPG", "a.JPG"]),
-    (["s/l/0.jpg", "s/r/0.png"], ["0.png"], [None, None]),
-])
+@pytest.mark.parametrize(
+    "names, there, found",
+    [
+        (["images/a.png", "images/b.png"], ["a.png", "b.png"], ["a.png", "b.png"]),
+        (["C:\\pictures\\a.png", "/home/x/b.png"], ["a.png", "b.png"], ["a.png", "b.png"]),
+        (["images/l/0.png", "images/r/0.png"], ["l/0.png", "r/0.png"], ["l/0.png", "r/0.png"]),
+        (["images/l/0.png", "images/r/0.png"], ["0.png"], [None, None]),
+        (["images/l/0.png", "images/r/1.png"], ["0.png", "r/1.png", "1.png"], ["0.png", "r/1.png"]),
+        (["./images/a", "images/a"], ["a.JPG"], ["a.JPG", "a.JPG"]),
+        (["s/l/0.jpg", "s/r/0.png"], ["0.png"], [None, None]),
+    ],
+)
 def test_counterparts_in_another_folder(names, there, found, folder):
     place, copies = folder(*there), Copies(names)
     assert [copies.find(place, name) for name in names] == [place / name if name else None for name in found]

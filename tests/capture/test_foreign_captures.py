@@ -8,15 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import tifffile
-from known_capture import (
-    BALL,
-    RADIUS,
-    known_cameras,
-    straight_png,
-    write_colmap,
-    write_idr,
-    write_nerf,
-)
+from known_capture import BALL, RADIUS, known_cameras, straight_png, write_colmap, write_idr, write_nerf
 from PIL import Image, ImageOps
 
 from gshell_mi.capture import CaptureConfig, read_capture
@@ -84,10 +76,16 @@ def test_what_no_list_trains_on_is_held_out(nerf):
     assert names(read_capture(nerf), False) == ["frame_00001.png"]
 
 
-@pytest.mark.parametrize("value, words", [
-    (["images/none.png"], "is missing"), (5, "is no list of file names"), (True, "is no list"),
-    ([["images/frame_00001.png"]], "is no list"), (["images/extra.png"], "which no frame shows"),
-])
+@pytest.mark.parametrize(
+    "value, words",
+    [
+        (["images/none.png"], "is missing"),
+        (5, "is no list of file names"),
+        (True, "is no list"),
+        ([["images/frame_00001.png"]], "is no list"),
+        (["images/extra.png"], "which no frame shows"),
+    ],
+)
 def test_lists_that_match_nothing(value, words, nerf):
     shutil.copy(nerf / "images/frame_00001.png", nerf / "images/extra.png")
     change(nerf, lambda d: d.update(val_filenames=value))
@@ -98,13 +96,20 @@ def test_lists_that_match_nothing(value, words, nerf):
 # --- numbers and names in JSON
 
 
-@pytest.mark.parametrize("text", [
-    '{"frames": ' + "[" * 100_000, '{"w": ' + "9" * 5000 + "}",
-    '{"frames": [{"file_path": "/", "transform_matrix": []}]}',
-    '{"frames": [{"file_path": "images/frame_00001.png", "transform_matrix": [[' + "9" * 400 + "]]}]}",
-    '{"w": ' + "9" * 400 + ', "frames": [{"file_path": "images/frame_00001.png", "transform_matrix": '
-    + json.dumps(np.eye(4).tolist()) + "}]}",
-])
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"frames": ' + "[" * 100_000,
+        '{"w": ' + "9" * 5000 + "}",
+        '{"frames": [{"file_path": "/", "transform_matrix": []}]}',
+        '{"frames": [{"file_path": "images/frame_00001.png", "transform_matrix": [[' + "9" * 400 + "]]}]}",
+        '{"w": '
+        + "9" * 400
+        + ', "frames": [{"file_path": "images/frame_00001.png", "transform_matrix": '
+        + json.dumps(np.eye(4).tolist())
+        + "}]}",
+    ],
+)
 def test_documents_that_break_readers(text, nerf, tmp_path, capfd):
     (nerf / "transforms.json").write_text(text, encoding="utf-8")
     assert main([str(nerf), "-o", str(tmp_path / "a.xml")]) == 2
@@ -178,10 +183,13 @@ def test_lines_of_images_that_end_in_another_way(model):
         assert [frame.image for frame in read_capture(model).frames] == [frame.image for frame in before]
 
 
-@pytest.mark.parametrize("edit, words", [
-    (lambda words: [words[0], "0", "0", "0", "0", *words[5:]], "The pose of image '.*' of "),
-    (lambda words: [*words[:9], "IMG 00.png"], "images.txt' has the image 'IMG 00.png' twice"),
-])
+@pytest.mark.parametrize(
+    "edit, words",
+    [
+        (lambda words: [words[0], "0", "0", "0", "0", *words[5:]], "The pose of image '.*' of "),
+        (lambda words: [*words[:9], "IMG 00.png"], "images.txt' has the image 'IMG 00.png' twice"),
+    ],
+)
 def test_images_that_no_model_has(edit, words, model):
     path = model / "sparse" / "0" / "images.txt"
     lines = path.read_text(encoding="utf-8").splitlines()
@@ -194,8 +202,9 @@ def test_images_that_no_model_has(edit, words, model):
 
 def test_widths_of_hundreds_of_digits(model):
     path = model / "sparse" / "0" / "cameras.txt"
-    path.write_text(path.read_text(encoding="utf-8").replace(" 16 12 ", f" {'9' * 400} 12 ", 1),
-                    encoding="utf-8")
+    path.write_text(
+        path.read_text(encoding="utf-8").replace(" 16 12 ", f" {'9' * 400} 12 ", 1), encoding="utf-8"
+    )
     with pytest.raises(UserError, match=r"cameras.txt' is malformed in line"):
         read_capture(model)
 
@@ -230,8 +239,10 @@ def test_names_with_backslashes(model):
 
 
 def test_xml_that_is_not_mitsubas(tmp_path):
-    (tmp_path / "cameras.xml").write_text('<?xml version="1.0"?><document><chunk><sensors><sensor id="0"/>'
-                                          '</sensors></chunk></document>', encoding="utf-8")
+    (tmp_path / "cameras.xml").write_text(
+        '<?xml version="1.0"?><document><chunk><sensors><sensor id="0"/></sensors></chunk></document>',
+        encoding="utf-8",
+    )
     for source in (tmp_path, tmp_path / "cameras.xml"):
         with pytest.raises(UserError, match=r"is no known capture.* Metashape .* export to COLMAP"):
             read_capture(source)
@@ -240,8 +251,9 @@ def test_xml_that_is_not_mitsubas(tmp_path):
 # --- masks
 
 
-@pytest.mark.parametrize("layout, works", [("{camera}/{name}", True), ("deep/{camera}/{name}", True),
-                                           ("{name}", False)])
+@pytest.mark.parametrize(
+    "layout, works", [("{camera}/{name}", True), ("deep/{camera}/{name}", True), ("{name}", False)]
+)
 def test_masks_of_images_of_one_name(layout, works, nerf):
     """``deep``: images and masks in two levels of folders."""
     inside = "deep/" if layout.startswith("deep") else ""
@@ -343,8 +355,12 @@ def test_mask_files_of_another_white_are_stretched(inverted, tmp_path):
     if inverted:
         values = 128 - values
     Image.fromarray(values).save(tmp_path / "mask.png")
-    frame = Frame(tmp_path / "a.png", Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4)), tmp_path / "mask.png",
-                  ignored=tmp_path / "mask.png")
+    frame = Frame(
+        tmp_path / "a.png",
+        Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4)),
+        tmp_path / "mask.png",
+        ignored=tmp_path / "mask.png",
+    )
     white = white_of([frame] * 3)
     assert white == ignored_white_of([frame]) == pytest.approx(128 / 255)
     found = coverage_of(frame, np.zeros((6, 8, 3), np.uint8), inverted=inverted, white=white)
@@ -388,11 +404,12 @@ def test_eight_bits_in_sixteen_are_no_numbers_of_parts(tmp_path):
 
 def test_masks_that_disagree_or_are_feathered_are_as_they_are(tmp_path):
     frames = []
-    fade = np.round(200 * np.exp(-((np.arange(64) - 32) / 12.0) ** 2))
+    fade = np.round(200 * np.exp(-(((np.arange(64) - 32) / 12.0) ** 2)))
     for name, values in (("full", [0, 255]), ("faint", [0, 200]), ("fainter", [0, 90]), ("feathered", fade)):
         Image.fromarray(np.outer(np.ones(8), values).astype(np.uint8)).save(tmp_path / f"{name}.png")
-        frames.append(Frame(tmp_path / "a.png", Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4)),
-                            tmp_path / f"{name}.png"))
+        frames.append(
+            Frame(tmp_path / "a.png", Camera(8, 6, 8.0, 8.0, 4.0, 3.0, np.eye(4)), tmp_path / f"{name}.png")
+        )
     full, faint, fainter, feathered = frames
     assert white_of([faint, full]) == white_of([faint, fainter]) == white_of([feathered] * 2) == 1
 
@@ -421,22 +438,26 @@ def idr_arrays(folder, edit):
 
 def pose_alone(arrays, index, camera):
     to_camera = np.stack([camera.right, -camera.up, camera.forward])
-    arrays[f"world_mat_{index}"] = np.vstack([np.column_stack([to_camera, -to_camera @ camera.origin]),
-                                              [0, 0, 0, 1]])
+    arrays[f"world_mat_{index}"] = np.vstack(
+        [np.column_stack([to_camera, -to_camera @ camera.origin]), [0, 0, 0, 1]]
+    )
 
 
 def test_poses_with_intrinsics_of_their_own(tmp_path):
     """As in DVR's cameras.npz."""
+
     def edit(arrays, index, camera):
         pose_alone(arrays, index, camera)
-        arrays[f"camera_mat_{index}"] = np.diag([2 * camera.fx / camera.width, 2 * camera.fy / camera.height,
-                                                 1.0, 1.0])
+        arrays[f"camera_mat_{index}"] = np.diag(
+            [2 * camera.fx / camera.width, 2 * camera.fy / camera.height, 1.0, 1.0]
+        )
 
     capture = read_capture(idr_arrays(tmp_path, edit))
     for frame, camera in zip(capture.frames, CAMERAS, strict=True):
         found = frame.camera
         assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx(
-            (camera.fx, camera.fy, camera.cx, camera.cy))
+            (camera.fx, camera.fy, camera.cx, camera.cy)
+        )
         np.testing.assert_allclose(found.center, camera.origin, atol=1e-9)
         np.testing.assert_allclose(found.forward, camera.forward, atol=1e-9)
 
@@ -448,6 +469,7 @@ def test_poses_without_intrinsics_are_told(tmp_path):
 
 def test_a_unit_sphere_that_nobody_has_fitted(tmp_path):
     """The world is in other units and off the origin, and scale_mat is the identity."""
+
     def edit(arrays, index, camera):
         moved = np.diag([0.01, 0.01, 0.01, 1.0])
         moved[:3, 3] = [-3, -4, -5]
@@ -458,7 +480,7 @@ def test_a_unit_sphere_that_nobody_has_fitted(tmp_path):
     result = import_capture(folder, tmp_path / "a.xml", config=CaptureConfig(resolution=8, up="keep"))
     center = (BALL + np.array([3, 4, 5])) * 100
     np.testing.assert_allclose(result.box.mean(axis=0), center, atol=10)
-    assert 200 * RADIUS < np.ptp(result.box, axis=0).max() < 300 * RADIUS    # masks are of few pixels
+    assert 200 * RADIUS < np.ptp(result.box, axis=0).max() < 300 * RADIUS  # masks are of few pixels
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
@@ -497,8 +519,9 @@ def test_light_with_infinity_is_refused(nerf, tmp_path):
 
 def test_damaged_light_ends_in_a_sentence(nerf, tmp_path, capfd):
     """A Radiance file that writes past the end of Mitsuba's memory."""
-    (tmp_path / "sun.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n\2\2\0\10"
-                                       + b"\x88\x80" * 4 + b"\x90\x10" * 40)
+    (tmp_path / "sun.hdr").write_bytes(
+        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n\2\2\0\10" + b"\x88\x80" * 4 + b"\x90\x10" * 40
+    )
     assert main([str(nerf), "-o", str(tmp_path / "a.xml"), "--light", str(tmp_path / "sun.hdr")]) == 2
     assert "cannot be read as an image (a scanline is damaged)" in " ".join(capfd.readouterr().err.split())
     assert not (tmp_path / "a.xml").exists()
@@ -508,6 +531,7 @@ def test_light_is_copied_in_a_kind_that_is_safe(nerf, tmp_path):
     radiance = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
     mi.Bitmap(radiance).write(str(tmp_path / "sun.hdr"))
     import_capture(nerf, tmp_path / "a.xml", config=CaptureConfig(light=tmp_path / "sun.hdr"))
-    np.testing.assert_array_equal(np.array(mi.Bitmap(str(tmp_path / "a" / "light.exr"))),
-                                  np.array(mi.Bitmap(str(tmp_path / "sun.hdr"))))
+    np.testing.assert_array_equal(
+        np.array(mi.Bitmap(str(tmp_path / "a" / "light.exr"))), np.array(mi.Bitmap(str(tmp_path / "sun.hdr")))
+    )
     assert 'value="a/light.exr"' in (tmp_path / "a.xml").read_text(encoding="utf-8")

@@ -14,8 +14,14 @@ from PIL import Image
 from gshell_mi.capture.__main__ import main
 
 FEW = known_cameras(4, width=24, height=18, fx=28, fy=28, cx=12, cy=9)
-WRITERS = {"nerf": write_nerf, "colmap": write_colmap, "idr": write_idr, "llff": write_llff,
-           "mitsuba": write_mitsuba, "colmap text": lambda f, c: write_colmap(f, c, binary=False)}
+WRITERS = {
+    "nerf": write_nerf,
+    "colmap": write_colmap,
+    "idr": write_idr,
+    "llff": write_llff,
+    "mitsuba": write_mitsuba,
+    "colmap text": lambda f, c: write_colmap(f, c, binary=False),
+}
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +36,15 @@ def originals(tmp_path_factory) -> Path:
 def cut(name, share=0.6):
     def spoil(folder):
         path = folder / name
-        path.write_bytes(path.read_bytes()[:int(share * path.stat().st_size)])
+        path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+
     return spoil
 
 
 def write(name, content):
     def spoil(folder):
         (folder / name).write_bytes(content)
+
     return spoil
 
 
@@ -44,28 +52,33 @@ def remove(name):
     def spoil(folder):
         path = folder / name
         shutil.rmtree(path) if path.is_dir() else path.unlink()
+
     return spoil
 
 
 def image(name, make, mode=None):
     def spoil(folder):
         make(Image.open(folder / name).convert(mode or "RGBA")).save(folder / name)
+
     return spoil
 
 
 def transforms(change):
     """Changes the parsed transforms_train.json in place, or replaces it by what ``change`` returns."""
+
     def spoil(folder):
         path = folder / "transforms_train.json"
         document = json.loads(path.read_text())
         changed = change(document)
         path.write_text(json.dumps(document if changed is None else changed))
+
     return spoil
 
 
 def pose(make):
-    return transforms(lambda d: d["frames"][1].update(transform_matrix=make(
-        np.array(d["frames"][1]["transform_matrix"]))))
+    return transforms(
+        lambda d: d["frames"][1].update(transform_matrix=make(np.array(d["frames"][1]["transform_matrix"])))
+    )
 
 
 def frame(**values):
@@ -78,6 +91,7 @@ def text(name, old, new):
         before = path.read_text()
         assert old in before
         path.write_text(before.replace(old, new, 1))
+
     return spoil
 
 
@@ -87,12 +101,14 @@ def arrays(change):
         stored = dict(np.load(path))
         change(stored)
         np.savez(path, **stored)
+
     return spoil
 
 
 def poses_bounds(change):
     def spoil(folder):
         np.save(folder / "poses_bounds.npy", change(np.load(folder / "poses_bounds.npy")))
+
     return spoil
 
 
@@ -112,6 +128,7 @@ def all_poses(change):
     def spoil(document):
         for entry in document["frames"]:
             entry["transform_matrix"] = change(np.array(entry["transform_matrix"])).tolist()
+
     return transforms(spoil)
 
 
@@ -154,8 +171,12 @@ CASES = {
     "pose mirrored": ("nerf", pose(lambda m: (m @ np.diag([-1, 1, 1, 1])).tolist()), [], "is mirrored"),
     "pose sheared": ("nerf", pose(lambda m: (m @ np.diag([1, 2, 1, 1])).tolist()), [], "is no rotation"),
     "pose of zeros": ("nerf", pose(lambda m: (0 * m).tolist()), [], "is singular"),
-    "pose absurdly far": ("nerf", pose(lambda m: (m + np.eye(4)[:, :1] * [0, 0, 0, 1e30]).tolist()), [],
-                          "too large"),
+    "pose absurdly far": (
+        "nerf",
+        pose(lambda m: (m + np.eye(4)[:, :1] * [0, 0, 0, 1e30]).tolist()),
+        [],
+        "too large",
+    ),
     "centre absurdly far": ("nerf", frame(cx=1e30), [], "impossible intrinsics"),
     "width of 0": ("llff", poses_bounds(lambda p: p * (np.arange(17) != 9)), [], "impossible intrinsics"),
     "pose transposed": ("nerf", pose(lambda m: m.T.tolist()), [], "row 0 0 0 1"),
@@ -182,8 +203,12 @@ CASES = {
     "mask of another size": ("idr", image("mask/002.png", lambda i: i.resize((9, 9)), "L"), [], "9 x 9"),
     "mask is text": ("idr", write("mask/001.png", b"white"), [], "001.png' cannot be read"),
     "masks of other names and number": ("idr", remove("mask/002.png"), [], "3 masks, 4 images"),
-    "masks inverted to nothing": ("nerf", nothing, ["--background", "white", "--background-tolerance", "99"],
-                                  "are empty"),
+    "masks inverted to nothing": (
+        "nerf",
+        nothing,
+        ["--background", "white", "--background-tolerance", "99"],
+        "are empty",
+    ),
     "COLMAP cameras cut off": ("colmap", cut("sparse/0/cameras.bin"), [], "cameras.bin' ends before"),
     "COLMAP images cut off": ("colmap", cut("sparse/0/images.bin"), [], "images.bin' ends before"),
     "COLMAP fisheye": ("colmap", fisheye, [], "OPENCV_FISHEYE"),
@@ -196,23 +221,41 @@ CASES = {
     "IDR image missing": ("idr", remove("image/000001.png"), [], "4 cameras"),
     "IDR cut off": ("idr", cut("cameras_sphere.npz"), [], "cannot be read"),
     "IDR other arrays": ("idr", lambda f: np.savez(f / "cameras_sphere.npz", x=1), [], "no world_mat_0"),
-    "IDR matrix of NaN": ("idr", arrays(lambda a: a.update(world_mat_1=np.full((4, 4), np.nan))), [],
-                          "camera 1 of"),
+    "IDR matrix of NaN": (
+        "idr",
+        arrays(lambda a: a.update(world_mat_1=np.full((4, 4), np.nan))),
+        [],
+        "camera 1 of",
+    ),
     "IDR singular": ("idr", arrays(lambda a: a.update(world_mat_1=np.zeros((4, 4)))), [], "is singular"),
     "LLFF of another shape": ("llff", poses_bounds(lambda p: p[:, :15]), [], "(4, 15)"),
     "LLFF too few poses": ("llff", poses_bounds(lambda p: p[:3]), [], "3 poses"),
     "LLFF with NaN": ("llff", poses_bounds(lambda p: p * np.nan), [], "NaN"),
     "LLFF of objects": ("llff", poses_bounds(lambda p: np.array([{}])), [], "cannot be read"),
     "XML cut off": ("mitsuba", cut("sensors.xml"), [], "cannot be loaded by Mitsuba"),
-    "XML not UTF-8": ("mitsuba", lambda f: write("sensors.xml", (f / "sensors.xml").read_bytes().replace(
-        b"shot_1", b"shot\xff1"))(f), [], "cannot be loaded by Mitsuba"),
+    "XML not UTF-8": (
+        "mitsuba",
+        lambda f: write("sensors.xml", (f / "sensors.xml").read_bytes().replace(b"shot_1", b"shot\xff1"))(f),
+        [],
+        "cannot be loaded by Mitsuba",
+    ),
     "XML film of another size": ("mitsuba", text("sensors.xml", 'value="24"', 'value="25"'), [], "25 x 18"),
-    "XML without sensors": ("mitsuba", write("sensors.xml", b"<scene version='3.0.0'/><!--<sensor-->"), [],
-                            "has no sensors"),
+    "XML without sensors": (
+        "mitsuba",
+        write("sensors.xml", b"<scene version='3.0.0'/><!--<sensor-->"),
+        [],
+        "has no sensors",
+    ),
     "empty folder": ("nerf", lambda f: [remove(JSON)(f), remove("train")(f)], [], "no known capture"),
     "two JSON files, neither the usual": (
-        "nerf", lambda f: [shutil.copy(f / JSON, f / "transforms_a.json"),
-                           (f / JSON).rename(f / "transforms_b.json")], [], "transforms_a"),
+        "nerf",
+        lambda f: [
+            shutil.copy(f / JSON, f / "transforms_a.json"),
+            (f / JSON).rename(f / "transforms_b.json"),
+        ],
+        [],
+        "transforms_a",
+    ),
     "box of no size": ("nerf", nothing, ["--box", "0", "0", "0", "1", "1", "0"], "is empty"),
     "box of NaN": ("nerf", nothing, ["--box", "nan", "0", "0", "1", "1", "1"], "NaN"),
     "unknown format": ("nerf", nothing, ["--format", "lego"], "--format"),
@@ -230,8 +273,12 @@ CASES = {
     "light missing": ("nerf", nothing, ["--light", "no.exr"], "--light"),
     "light no image": ("nerf", nothing, ["--light", "{source}/transforms_train.json"], "environment map"),
     "exposures no table": ("nerf", nothing, ["--exposures", "{source}/train/r_0.png"], "--exposures"),
-    "exposures incomplete": ("nerf", write("e.json", b'{"r_0.png": 0}'), ["--exposures", "{source}/e.json"],
-                             "'r_1.png'"),
+    "exposures incomplete": (
+        "nerf",
+        write("e.json", b'{"r_0.png": 0}'),
+        ["--exposures", "{source}/e.json"],
+        "'r_1.png'",
+    ),
 }
 
 
@@ -283,7 +330,8 @@ def test_failed_import_keeps_the_earlier_scene(originals, tmp_path, capfd, varia
     _fails([*arguments, "--overwrite"], "cannot be read", capfd)
     after = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert {p: b for p, b in before.items() if p.name != "r_3.png"} == {
-        p: b for p, b in after.items() if p.name != "r_3.png"}
+        p: b for p, b in after.items() if p.name != "r_3.png"
+    }
     write_nerf(source, FEW[:3])
     assert main([*arguments, "--overwrite"]) == 0
     assert not (tmp_path / "scene" / "view_003.exr").exists()

@@ -45,8 +45,10 @@ def test_targets_of_reduced_photographs_are_those_of_whole_ones(tmp_path):
     Image.fromarray(picture).save(tmp_path / "a.jpg", quality=97, subsampling=0)
     Image.fromarray(picture).save(tmp_path / "a.png")
     camera = Camera(800, 600, 900.0, 900.0, 400.0, 300.0, np.eye(4))
-    whole, reduced = (Preparation(max_size=100).target(Frame(tmp_path / name, camera, tmp_path / "mask.png"))
-                      for name in ("a.png", "a.jpg"))
+    whole, reduced = (
+        Preparation(max_size=100).target(Frame(tmp_path / name, camera, tmp_path / "mask.png"))
+        for name in ("a.png", "a.jpg")
+    )
     assert read_reduced(tmp_path / "a.jpg", 200)[1] == 4
     for name in ("width", "height", "fx", "fy", "cx", "cy"):
         assert getattr(whole.camera, name) == pytest.approx(getattr(reduced.camera, name))

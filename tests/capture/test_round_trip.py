@@ -65,8 +65,17 @@ def test_targets_are_the_images_that_the_sensors_see(imported):
     """Against closed-form images of cameras without lens and with square pixels."""
     cameras, _, scene, _ = imported
     for target, truth in list(zip(scene.targets, cameras, strict=True))[::4]:
-        straight = type(truth)(truth.origin, truth.forward, truth.up, truth.width, truth.height, truth.fx,
-                               truth.fx, truth.cx, truth.cy)
+        straight = type(truth)(
+            truth.origin,
+            truth.forward,
+            truth.up,
+            truth.width,
+            truth.height,
+            truth.fx,
+            truth.fx,
+            truth.cx,
+            truth.cy,
+        )
         expected = straight.render()
         error = np.abs(target.rgba - expected)
         assert error.mean() < 0.006
@@ -77,7 +86,7 @@ def test_targets_are_the_images_that_the_sensors_see(imported):
 
 
 def _centroid(alpha):
-    v, u = np.mgrid[0.5:alpha.shape[0], 0.5:alpha.shape[1]]
+    v, u = np.mgrid[0.5 : alpha.shape[0], 0.5 : alpha.shape[1]]
     return np.array([(alpha * u).sum(), (alpha * v).sum()]) / alpha.sum()
 
 

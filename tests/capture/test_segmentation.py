@@ -71,7 +71,7 @@ def test_images_with_alpha_lack_no_masks(tmp_path):
 
 def test_box_is_told_in_the_scene():
     turned = np.eye(4)
-    turned[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]    # the capture's x is the scene's y
+    turned[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # the capture's x is the scene's y
     subject = _boxed(None, np.array([[0.0, 0, 0], [1, 2, 3]]), turned)
     np.testing.assert_allclose(subject.box, [[0, -1, 0], [2, 0, 3]], atol=1e-12)
 
@@ -82,7 +82,7 @@ def test_a_photograph_of_the_background_says_what_differs(shots, tmp_path):
     empty[truth] = 255 - empty[truth]
     Image.fromarray(empty).save(tmp_path / "empty.png")
     config = CaptureConfig(background=str(tmp_path / "empty.png"))
-    view, = _with_priors([View(image, camera)], config)
+    (view,) = _with_priors([View(image, camera)], config)
     assert (view.prior[~truth] < 0.5).all() and (view.prior[truth] >= 0.5).mean() > 0.5
     Image.fromarray(empty[:50]).save(tmp_path / "empty.png")
     with pytest.raises(UserError, match="another aspect"):

@@ -23,8 +23,9 @@ FEW = CaptureConfig(resolution=32)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*")
-            if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +44,12 @@ def imported(photographs, tmp_path) -> Path:
 
 
 def again(folder: Path, **options):
-    return import_capture(folder.parent / "set", folder.with_suffix(".xml"), overwrite=True,
-                          config=CaptureConfig(resolution=48, **options))
+    return import_capture(
+        folder.parent / "set",
+        folder.with_suffix(".xml"),
+        overwrite=True,
+        config=CaptureConfig(resolution=48, **options),
+    )
 
 
 def test_what_lies_in_the_folder_stays(imported):
@@ -88,8 +93,12 @@ def test_photographs_with_the_names_of_targets_stay(imported):
         image.rename(imported / image.name)
     before = contents(imported)
     with pytest.raises(UserError, match=r"view_000.exr' is read by this run and would be replaced by it"):
-        import_capture(imported.parent / "other", imported.with_suffix(".xml"), overwrite=True,
-                       config=CaptureConfig(images=imported, box=(-1, -1, -1, 1, 1, 1)))
+        import_capture(
+            imported.parent / "other",
+            imported.with_suffix(".xml"),
+            overwrite=True,
+            config=CaptureConfig(images=imported, box=(-1, -1, -1, 1, 1, 1)),
+        )
     assert contents(imported) == before
 
 
@@ -152,12 +161,19 @@ def test_the_picture_of_the_earlier_views_goes_and_anothers_stays(imported):
     assert report.picture.read_bytes() == b"mine"
 
 
-@pytest.mark.parametrize(("name", "words"), [
-    (".", "must end in .xml"), ("", "must end in .xml"), ("..", "must end in .xml"),
-    ("/", "must end in .xml"),
-    ("{}/my$vase.xml", r"has a '\$', which Mitsuba takes for a parameter"),
-    ("{}/a\nb.xml", "has characters that cannot be printed"), ("{}/a\udc80.xml", "cannot be printed"),
-    ("{}/" + "x" * 300 + ".xml", "is longer than 200 bytes")])
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        (".", "must end in .xml"),
+        ("", "must end in .xml"),
+        ("..", "must end in .xml"),
+        ("/", "must end in .xml"),
+        ("{}/my$vase.xml", r"has a '\$', which Mitsuba takes for a parameter"),
+        ("{}/a\nb.xml", "has characters that cannot be printed"),
+        ("{}/a\udc80.xml", "cannot be printed"),
+        ("{}/" + "x" * 300 + ".xml", "is longer than 200 bytes"),
+    ],
+)
 def test_outputs_that_cannot_be(photographs, tmp_path, monkeypatch, name, words):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=words):
@@ -216,14 +232,18 @@ def test_killed_while_the_new_files_move_in(imported, monkeypatch, moves):
     assert there["s/notes.txt"] == b"mine"
     if moves == 0:
         assert {name: data for name, data in there.items() if MARK not in name} == {
-            name: data for name, data in old.items() if MARK not in name}
+            name: data for name, data in old.items() if MARK not in name
+        }
     else:
         assert "s.xml" not in there
     again(imported)
     monkeypatch.undo()
     shutil.copytree(imported.parent / "set", imported.parent / "fresh" / "set")
-    import_capture(imported.parent / "fresh" / "set", imported.parent / "fresh" / "s.xml",
-                   config=CaptureConfig(resolution=48))
+    import_capture(
+        imported.parent / "fresh" / "set",
+        imported.parent / "fresh" / "s.xml",
+        config=CaptureConfig(resolution=48),
+    )
     fresh = {name for name in contents(imported.parent / "fresh" / "s")}
     assert set(contents(imported)) == fresh | {"notes.txt"}
 
@@ -232,7 +252,9 @@ def test_a_planted_link_is_no_place_to_work(tmp_path):
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "a.txt").write_text("precious")
     (tmp_path / ".s.partial").symlink_to(tmp_path / "precious")
-    with (pytest.raises(UserError, match=r".s.partial' is in the way and is a link"),
-          staged(tmp_path / "s.xml", overwrite=False, source=tmp_path / "none")):
+    with (
+        pytest.raises(UserError, match=r".s.partial' is in the way and is a link"),
+        staged(tmp_path / "s.xml", overwrite=False, source=tmp_path / "none"),
+    ):
         pass
     assert (tmp_path / "precious" / "a.txt").read_text() == "precious"

@@ -23,20 +23,23 @@ from gshell_mi.capture.workspace import Workspace
 from gshell_mi.errors import UserError
 from gshell_mi.scene import load_fit_scene
 
-needs_extras = pytest.mark.skipif(find_spec("pycolmap") is None or find_spec("cv2") is None,
-                                  reason="needs the extras 'colmap' and 'masks'")
+needs_extras = pytest.mark.skipif(
+    find_spec("pycolmap") is None or find_spec("cv2") is None, reason="needs the extras 'colmap' and 'masks'"
+)
 
 
 def test_colmap_ends_with_a_command_that_is_killed(tmp_path):
     """Or the same command, given again, would make it work in one folder twice."""
     pytest.importorskip("pycolmap", reason="needs the extra 'colmap'")
-    os.mkfifo(tmp_path / "job.json")    # it waits for what nobody writes
-    start = ("import subprocess, sys; worker = subprocess.Popen([sys.executable, '-m', "
-             "'gshell_mi.capture.colmap_worker', sys.argv[1]], stdout=subprocess.PIPE); "
-             "print(worker.pid, flush=True); worker.wait()")
+    os.mkfifo(tmp_path / "job.json")  # it waits for what nobody writes
+    start = (
+        "import subprocess, sys; worker = subprocess.Popen([sys.executable, '-m', "
+        "'gshell_mi.capture.colmap_worker', sys.argv[1]], stdout=subprocess.PIPE); "
+        "print(worker.pid, flush=True); worker.wait()"
+    )
     with subprocess.Popen([sys.executable, "-c", start, str(tmp_path)], stdout=subprocess.PIPE) as command:
         worker = Path(f"/proc/{int(command.stdout.readline())}")
-        reader = os.open(tmp_path / "job.json", os.O_WRONLY)    # opens once the worker reads
+        reader = os.open(tmp_path / "job.json", os.O_WRONLY)  # opens once the worker reads
         assert worker.exists()
         command.kill()
     for _ in range(100):
@@ -49,11 +52,16 @@ def test_colmap_ends_with_a_command_that_is_killed(tmp_path):
 
 def tracks(cameras, points, rng):
     """Keypoints and matches of points seen by cameras, with wrong matches among them."""
-    keypoints = {i: camera.project(points) + 0.3 * rng.standard_normal((len(points), 2))
-                 for i, camera in enumerate(cameras)}
+    keypoints = {
+        i: camera.project(points) + 0.3 * rng.standard_normal((len(points), 2))
+        for i, camera in enumerate(cameras)
+    }
     right = np.stack([np.arange(len(points))] * 2, axis=1)
-    return keypoints, {(i, j): np.concatenate([right, rng.integers(len(points), size=(20, 2))])
-                       for i in range(len(cameras)) for j in range(i + 1, len(cameras))}
+    return keypoints, {
+        (i, j): np.concatenate([right, rng.integers(len(points), size=(20, 2))])
+        for i in range(len(cameras))
+        for j in range(i + 1, len(cameras))
+    }
 
 
 def test_nothing_stands_still_for_a_camera_that_goes_around():
@@ -111,9 +119,12 @@ def aligned_errors(found, true):
     moved = turn.apply(a - a.mean(axis=0))
     scale = (moved * (b - b.mean(axis=0))).sum() / (moved**2).sum()
     off = np.linalg.norm(scale * moved - (b - b.mean(axis=0)), axis=1)
-    angles = [(Rotation.from_matrix(t.to_world[:3, :3]).inv() * turn
-               * Rotation.from_matrix(f.to_world[:3, :3])).magnitude()
-              for f, t in zip(found, true, strict=True)]
+    angles = [
+        (
+            Rotation.from_matrix(t.to_world[:3, :3]).inv() * turn * Rotation.from_matrix(f.to_world[:3, :3])
+        ).magnitude()
+        for f, t in zip(found, true, strict=True)
+    ]
     return np.degrees(angles), off / np.linalg.norm(b - b.mean(axis=0), axis=1).mean()
 
 
@@ -129,8 +140,18 @@ def test_mere_photographs_become_a_scene(tmp_path, monkeypatch, capfd, variant):
         Image.fromarray(image).save(folder / f"IMG {index:02}.jpg", quality=95)
         truth[f"IMG {index:02}.jpg"] = mask >= 0.5
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    command = [str(folder), "-o", str(tmp_path / "out" / "s.xml"), "--quiet", "--variant", variant,
-               "--hold-out", "8", "--max-size", "0"]
+    command = [
+        str(folder),
+        "-o",
+        str(tmp_path / "out" / "s.xml"),
+        "--quiet",
+        "--variant",
+        variant,
+        "--hold-out",
+        "8",
+        "--max-size",
+        "0",
+    ]
     assert main(command) == 0
     assert "cameras and masks" in capfd.readouterr().out
     assert (tmp_path / "out" / "s" / "check.png").is_file()
@@ -138,15 +159,19 @@ def test_mere_photographs_become_a_scene(tmp_path, monkeypatch, capfd, variant):
     assert sum(view["id"].startswith("test_") for view in record["views"]) == 3
     scene = load_fit_scene(tmp_path / "out" / "s.xml")
     names = {view["id"]: view["image"].rsplit("/")[-1] for view in record["views"]}
-    overlaps = [photographed.overlap(target.rgba[..., 3] >= 0.5, truth[names[sensor.id()]])
-                for sensor, target in zip(scene.sensors, scene.targets, strict=True)]
+    overlaps = [
+        photographed.overlap(target.rgba[..., 3] >= 0.5, truth[names[sensor.id()]])
+        for sensor, target in zip(scene.sensors, scene.targets, strict=True)
+    ]
     assert len(overlaps) == 17 and np.mean(overlaps) > 0.95
     capture, _ = place(photographs_in(folder), folder, Workspace(tmp_path / "out" / "s.work"))
     degrees, distances = aligned_errors([frame.camera for frame in capture.frames], cameras)
     assert np.median(degrees) < 0.3 and np.median(distances) < 0.01
     to_scene = np.array(record["capture_to_scene"])[:3, :3]
-    ups = [to_scene @ capture.frames[k].camera.to_world[:3, :3] @ cameras[k].to_world[:3, :3].T @ [0, 1, 0]
-           for k in range(len(cameras))]
+    ups = [
+        to_scene @ capture.frames[k].camera.to_world[:3, :3] @ cameras[k].to_world[:3, :3].T @ [0, 1, 0]
+        for k in range(len(cameras))
+    ]
     assert np.mean(ups, axis=0)[1] > 0.999
     monkeypatch.setattr(structure_from_motion, "_run_colmap", None)
     assert main([*command, "--overwrite"]) == 0
@@ -162,8 +187,10 @@ def test_a_video_becomes_a_scene(tmp_path, variant):
     for camera in photographed.cameras(60)[::2]:
         writer.send(np.ascontiguousarray(photographed.photograph(camera)[0]).tobytes())
     writer.close()
-    assert main([str(video), "-o", str(tmp_path / "s.xml"), "--quiet", "--variant", variant,
-                 "--frames", "24"]) == 0
+    assert (
+        main([str(video), "-o", str(tmp_path / "s.xml"), "--quiet", "--variant", variant, "--frames", "24"])
+        == 0
+    )
     assert len(load_fit_scene(tmp_path / "s.xml").sensors) >= 22
     assert "gshell_mi.capture" in (tmp_path / "s.work" / "steps.json").read_text()
 

@@ -16,7 +16,7 @@ def test_the_object_stands_on_its_floor():
     sides = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1]])
     inside = photographed.CENTER + photographed.RADIUS * sides
     assert ((inside > subject.box[0]) & (inside < subject.box[1])).all()
-    assert np.ptp(subject.box, axis=0).max() < 2.0    # the table is three wide
+    assert np.ptp(subject.box, axis=0).max() < 2.0  # the table is three wide
 
 
 def test_parts_with_nothing_between_them_are_one_object():
@@ -43,15 +43,16 @@ def test_cameras_side_by_side_look_at_nothing_in_common():
 
 @pytest.mark.parametrize("binary", [True, False])
 def test_points_of_colmap_models(binary, tmp_path):
-    points = [(1.0, 2.0, 3.0, 4), (-1.0, 0.5, 0.25, 2), (0.0, 0.0, 9.0, 3)]    # last: the track's length
+    points = [(1.0, 2.0, 3.0, 4), (-1.0, 0.5, 0.25, 2), (0.0, 0.0, 9.0, 3)]  # last: the track's length
     if binary:
         data = struct.pack("<Q", len(points))
         for index, (x, y, z, track) in enumerate(points):
             data += struct.pack("<Q3d3BdQ", index, x, y, z, 9, 9, 9, 0.5, track) + b"\0" * 8 * track
         (tmp_path / "points3D.bin").write_bytes(data)
     else:
-        lines = [f"{index} {x} {y} {z} 9 9 9 0.5 {'1 2 ' * track}" for index, (x, y, z, track)
-                 in enumerate(points)]
+        lines = [
+            f"{index} {x} {y} {z} 9 9 9 0.5 {'1 2 ' * track}" for index, (x, y, z, track) in enumerate(points)
+        ]
         (tmp_path / "points3D.txt").write_text("# 3D point list\n" + "\n".join(lines))
     np.testing.assert_array_equal(sparse_points(tmp_path), [[1, 2, 3], [0, 0, 9]])
     assert sparse_points(tmp_path / "none").shape == (0, 3)

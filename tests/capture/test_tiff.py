@@ -28,10 +28,10 @@ def test_colour_is_freed_of_alpha(tmp_path):
     np.testing.assert_allclose(found / 65535, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("options, expected", [
-    ({"photometric": "rgb", "planarconfig": "separate"}, (6, 8, 3)),
-    ({"photometric": "rgb"}, (6, 8, 3)),
-])
+@pytest.mark.parametrize(
+    "options, expected",
+    [({"photometric": "rgb", "planarconfig": "separate"}, (6, 8, 3)), ({"photometric": "rgb"}, (6, 8, 3))],
+)
 def test_planes_and_pixels(options, expected, tmp_path):
     stored = (255 * PIXELS[..., :3]).astype(np.uint8)
     separate = np.moveaxis(stored, -1, 0) if "planarconfig" in options else stored
@@ -53,7 +53,7 @@ def test_colours_of_no_known_kind_are_told(tmp_path):
     with tifffile.TiffFile(path) as file:
         place = file.pages.first.tags["PhotometricInterpretation"].valueoffset
     data = bytearray(path.read_bytes())
-    data[place:place + 2] = (12345).to_bytes(2, "little")
+    data[place : place + 2] = (12345).to_bytes(2, "little")
     path.write_bytes(data)
     with pytest.raises(UserError, match="12345"):
         read_pixels(path)

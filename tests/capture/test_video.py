@@ -36,12 +36,13 @@ def clip(tmp_path_factory):
     path = tmp_path_factory.mktemp("clip") / "a clip, Möbel.mp4"
     rng = np.random.default_rng(0)
     pattern = np.clip(ndimage.gaussian_filter(rng.standard_normal((64, 128)), 1.5) * 150 + 128, 0, 255)
-    writer = imageio_ffmpeg.write_frames(str(path), (64, 64), fps=12, codec="libx264", quality=9,
-                                         macro_block_size=16)
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (64, 64), fps=12, codec="libx264", quality=9, macro_block_size=16
+    )
     writer.send(None)
     frames = []
     for index in range(12):
-        frame = pattern[:, 4 * index:4 * index + 64]
+        frame = pattern[:, 4 * index : 4 * index + 64]
         if index % 3 != 1:
             frame = ndimage.gaussian_filter(frame, 3)
         frames.append(np.repeat(frame.astype(np.uint8)[..., None], 3, axis=-1))

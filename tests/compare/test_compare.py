@@ -38,8 +38,9 @@ def scores(*arguments, tmp_path) -> dict:
 
 
 def test_fit_against_its_targets(sphere, tmp_path, capsys):
-    found = scores(sphere.folder, "-o", tmp_path / "errors", "--mesh", sphere.folder / "mesh.ply",
-                   tmp_path=tmp_path)
+    found = scores(
+        sphere.folder, "-o", tmp_path / "errors", "--mesh", sphere.folder / "mesh.ply", tmp_path=tmp_path
+    )
     assert set(found["views"]) == {"view_000", "view_001"}
     assert found["mean"]["psnr"] > 30 and found["mean"]["mask_iou"] > 0.97
     assert found["mesh"]["boundary_loops"] == {"found": 1, "reference": 1}
@@ -51,8 +52,9 @@ def test_fit_against_its_targets(sphere, tmp_path, capsys):
 
 def test_relighting_is_scored_raw_and_scaled(sphere, tmp_path):
     """Targets half as bright: the albedo's factor is 1/2, and only the scaled score is high."""
-    found = scores(sphere.folder, "--envmap", sphere.folder / "light.exr", "--targets", sphere.dim,
-                   tmp_path=tmp_path)
+    found = scores(
+        sphere.folder, "--envmap", sphere.folder / "light.exr", "--targets", sphere.dim, tmp_path=tmp_path
+    )
     np.testing.assert_allclose(found["albedo_scale"], 0.5, rtol=0.02)
     assert found["mean_albedo_scaled"]["psnr"] > 30 > 25 > found["mean"]["psnr"]
 
@@ -61,8 +63,7 @@ def test_files_and_folders(sphere, tmp_path):
     whole = scores(sphere.targets, sphere.dim, tmp_path=tmp_path)
     one = scores(sphere.targets / "view_000.exr", sphere.dim / "view_000.exr", tmp_path=tmp_path)
     assert one["mean"] == one["views"]["view_000"] == whole["views"]["view_000"]
-    assert whole["mean"]["psnr"] == pytest.approx(
-        np.mean([view["psnr"] for view in whole["views"].values()]))
+    assert whole["mean"]["psnr"] == pytest.approx(np.mean([view["psnr"] for view in whole["views"].values()]))
 
 
 def test_images_that_show_the_object_nowhere_alike(tmp_path, capsys):
@@ -81,42 +82,60 @@ def test_meshes(sphere, tmp_path):
 
 
 def test_other_sensors(sphere, tmp_path):
-    found = scores(sphere.folder, "--sensors", sphere.folder / "scene.xml", "--targets", sphere.targets,
-                   tmp_path=tmp_path)
+    found = scores(
+        sphere.folder,
+        "--sensors",
+        sphere.folder / "scene.xml",
+        "--targets",
+        sphere.targets,
+        tmp_path=tmp_path,
+    )
     assert found["mean"]["psnr"] > 30
 
 
-@pytest.mark.parametrize("arguments, message", [
-    (("{none}",), "does not exist; check the path"),
-    (("{mesh}",), "is compared with nothing; give the reference after it"),
-    (("{empty}",), "holds no fit (scene.xml is missing)"),
-    (("{fit}", "--spp", "0"), "--spp must be at least 1"),
-    (("{fit}", "--sensors", "{none}"), "give their images with --targets"),
-    (("{fit}", "--sensors", "{none}", "--targets", "{empty}"), "does not exist; check the path"),
-    (("{fit}", "--targets", "{empty}"), "view_000.exr' is missing"),
-    (("{fit}", "--envmap", "{none}", "--targets", "{targets}"), "does not exist; check the path"),
-    (("{fit}", "--envmap", "{text}", "--targets", "{targets}"), "cannot be read"),
-    (("{fit}", "--mesh", "{none}"), "does not exist; check the path"),
-    (("{fit}", "--mesh", "{text}"), "cannot be read"),
-    (("{fit}", "--variant", "scalar_rgb"), "is not usable"),
-    (("{fit}", "--spp", "10000000000"), "GiB are free; lower --spp"),
-    (("{targets}", "{none}"), "does not exist; check the path"),
-    (("{targets}", "{targets}/view_000.exr"), "are a folder and a file"),
-    (("{targets}", "{empty}"), "have no EXR files of the same name"),
-    (("{mesh}", "{targets}"), "only one is a mesh"),
-    (("{targets}", "{targets}", "--mesh", "{mesh}"), "--mesh is for fits only"),
-    (("{targets}/view_000.exr", "{fit}/scene.xml"), "cannot be read"),
-    (("{targets}/view_000.exr", "{fit}/light.exr"), "only images of one size"),
-    (("{targets}", "{dim}", "--json", "{none}/a/b.json"), "cannot be written"),
-    (("{targets}", "{dim}", "--json", "/dev/full/a"), "'/dev/full/a' cannot be written"),
-    (("{targets}/view_000.exr", "{dim}/view_000.exr", "--json", "{dim}/view_000.exr"), "was not written by"),
-])
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("{none}",), "does not exist; check the path"),
+        (("{mesh}",), "is compared with nothing; give the reference after it"),
+        (("{empty}",), "holds no fit (scene.xml is missing)"),
+        (("{fit}", "--spp", "0"), "--spp must be at least 1"),
+        (("{fit}", "--sensors", "{none}"), "give their images with --targets"),
+        (("{fit}", "--sensors", "{none}", "--targets", "{empty}"), "does not exist; check the path"),
+        (("{fit}", "--targets", "{empty}"), "view_000.exr' is missing"),
+        (("{fit}", "--envmap", "{none}", "--targets", "{targets}"), "does not exist; check the path"),
+        (("{fit}", "--envmap", "{text}", "--targets", "{targets}"), "cannot be read"),
+        (("{fit}", "--mesh", "{none}"), "does not exist; check the path"),
+        (("{fit}", "--mesh", "{text}"), "cannot be read"),
+        (("{fit}", "--variant", "scalar_rgb"), "is not usable"),
+        (("{fit}", "--spp", "10000000000"), "GiB are free; lower --spp"),
+        (("{targets}", "{none}"), "does not exist; check the path"),
+        (("{targets}", "{targets}/view_000.exr"), "are a folder and a file"),
+        (("{targets}", "{empty}"), "have no EXR files of the same name"),
+        (("{mesh}", "{targets}"), "only one is a mesh"),
+        (("{targets}", "{targets}", "--mesh", "{mesh}"), "--mesh is for fits only"),
+        (("{targets}/view_000.exr", "{fit}/scene.xml"), "cannot be read"),
+        (("{targets}/view_000.exr", "{fit}/light.exr"), "only images of one size"),
+        (("{targets}", "{dim}", "--json", "{none}/a/b.json"), "cannot be written"),
+        (("{targets}", "{dim}", "--json", "/dev/full/a"), "'/dev/full/a' cannot be written"),
+        (
+            ("{targets}/view_000.exr", "{dim}/view_000.exr", "--json", "{dim}/view_000.exr"),
+            "was not written by",
+        ),
+    ],
+)
 def test_mistakes(sphere, tmp_path, capsys, arguments, message):
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.ply").write_text("no mesh")
-    places = {"none": tmp_path / "none", "empty": tmp_path / "empty", "text": tmp_path / "text.ply",
-              "fit": sphere.folder, "mesh": sphere.folder / "mesh.ply", "targets": sphere.targets,
-              "dim": sphere.dim}
+    places = {
+        "none": tmp_path / "none",
+        "empty": tmp_path / "empty",
+        "text": tmp_path / "text.ply",
+        "fit": sphere.folder,
+        "mesh": sphere.folder / "mesh.ply",
+        "targets": sphere.targets,
+        "dim": sphere.dim,
+    }
     assert main([argument.format(**places) for argument in arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and message in error and error.count("\n") == 1

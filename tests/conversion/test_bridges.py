@@ -18,17 +18,24 @@ def hook(columns: int = 60) -> trimesh.Trimesh:
     y = GAP / 2 * np.sin(angle)
     vertices = np.concatenate([np.stack([x, y, np.full(columns, z)], axis=1) for z in (0, 0.2)])
     low = np.arange(columns - 1)
-    faces = np.concatenate([np.stack([low, low + 1, low + columns + 1], axis=1),
-                            np.stack([low, low + columns + 1, low + columns], axis=1)])
+    faces = np.concatenate(
+        [
+            np.stack([low, low + 1, low + columns + 1], axis=1),
+            np.stack([low, low + columns + 1, low + columns], axis=1),
+        ]
+    )
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-@pytest.mark.parametrize(("x", "reach", "expected"), [
-    (0.9, 0.3, True),     # 1.8 apart along the strip
-    (0.5, 0.3, True),
-    (0.9, 3.0, False),
-    (0.02, 0.3, False),   # beside the bend
-])
+@pytest.mark.parametrize(
+    ("x", "reach", "expected"),
+    [
+        (0.9, 0.3, True),  # 1.8 apart along the strip
+        (0.5, 0.3, True),
+        (0.9, 3.0, False),
+        (0.02, 0.3, False),  # beside the bend
+    ],
+)
 def test_edges_across_the_gap(x, reach, expected):
     mesh = hook()
     points = np.array([[x, side * GAP / 2, 0.1] for side in (-1, 1)])

@@ -48,13 +48,18 @@ def test_a_mirrored_transform_keeps_the_outside():
     assert found.volume == pytest.approx(BALL.volume)
 
 
-@pytest.mark.parametrize("spoilt, words", [
-    (mesh(BALL.faces, np.where(np.arange(len(BALL.vertices))[:, None] == 5, np.nan, BALL.vertices)),
-     "vertices at NaN or infinity"),
-    (mesh([[0, 0, 1], [2, 3, 3]]), "no triangles with an area"),
-    (mesh([[0, 1, 2]], [[0, 0, 0], [1, 1, 1], [2, 2, 2]]), "no triangles with an area"),
-    (mesh(np.zeros((0, 3), int)), "no triangles"),
-])
+@pytest.mark.parametrize(
+    "spoilt, words",
+    [
+        (
+            mesh(BALL.faces, np.where(np.arange(len(BALL.vertices))[:, None] == 5, np.nan, BALL.vertices)),
+            "vertices at NaN or infinity",
+        ),
+        (mesh([[0, 0, 1], [2, 3, 3]]), "no triangles with an area"),
+        (mesh([[0, 1, 2]], [[0, 0, 0], [1, 1, 1], [2, 2, 2]]), "no triangles with an area"),
+        (mesh(np.zeros((0, 3), int)), "no triangles"),
+    ],
+)
 def test_meshes_without_a_surface(spoilt, words):
     with pytest.raises(UserError, match=words):
         loaded_mesh(spoilt, "mesh")

@@ -9,8 +9,15 @@ from gshell_mi.lattice import TetLattice
 @pytest.fixture(scope="module")
 def sheet():
     """Four triangles in the plane z = 0.1, and two that stand on one side of it."""
-    vertices = [[-0.5, -0.5, 0.1], [0.5, -0.5, 0.1], [0.5, 0.5, 0.1], [-0.5, 0.5, 0.1], [0, 0, 0.1],
-                [0.5, -0.5, 0.6], [0.5, 0.5, 0.6]]
+    vertices = [
+        [-0.5, -0.5, 0.1],
+        [0.5, -0.5, 0.1],
+        [0.5, 0.5, 0.1],
+        [-0.5, 0.5, 0.1],
+        [0, 0, 0.1],
+        [0.5, -0.5, 0.6],
+        [0.5, 0.5, 0.6],
+    ]
     faces = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [1, 5, 2], [2, 5, 6]]
     return trimesh.Trimesh(vertices, faces, process=False)
 
@@ -19,10 +26,12 @@ def test_nearest_faces_against_all(sheet):
     lattice, reach = TetLattice(12), 0.4
     vertex, face = nearest_faces(sheet, lattice, reach)
     p = lattice.vertex_positions().astype(float)
-    all_distances = np.stack([
-        np.linalg.norm(p - trimesh.triangles.closest_point(np.repeat(t[None], len(p), axis=0), p), axis=1)
-        for t in sheet.triangles
-    ])
+    all_distances = np.stack(
+        [
+            np.linalg.norm(p - trimesh.triangles.closest_point(np.repeat(t[None], len(p), axis=0), p), axis=1)
+            for t in sheet.triangles
+        ]
+    )
     least = all_distances.min(axis=0)
     clear = np.abs(least - reach) > 1e-4
     np.testing.assert_array_equal(np.isin(np.arange(len(p)), vertex)[clear], (least < reach)[clear])

@@ -13,8 +13,12 @@ def square():
     """Vertices one apart, faces, and each vertex's column and row."""
     y, x = (a.ravel() for a in np.mgrid[:SIDE, :SIDE])
     low = np.flatnonzero((x < SIDE - 1) & (y < SIDE - 1))
-    faces = np.concatenate([np.stack([low, low + 1, low + SIDE + 1], axis=1),
-                            np.stack([low, low + SIDE + 1, low + SIDE], axis=1)])
+    faces = np.concatenate(
+        [
+            np.stack([low, low + 1, low + SIDE + 1], axis=1),
+            np.stack([low, low + SIDE + 1, low + SIDE], axis=1),
+        ]
+    )
     return np.stack([x, y, 0 * x], axis=1).astype(float), faces, x, y
 
 

@@ -49,12 +49,12 @@ def test_a_moebius_strip_keeps_one_seam():
     vertices = np.concatenate([middle - 0.2 * across, middle + 0.2 * across])
     faces = []
     for k in range(60):
-        a, b, c, d = (k, k + 60, k + 1, k + 61) if k < 59 else (59, 119, 60, 0)    # half a turn
+        a, b, c, d = (k, k + 60, k + 1, k + 61) if k < 59 else (59, 119, 60, 0)  # half a turn
         faces += [[a, b, c], [b, d, c]]
     faces = np.array(faces)
     turned = np.random.default_rng(0).random(len(faces)) < 0.4
     faces[turned] = faces[turned, ::-1]
     found = oriented(trimesh.Trimesh(vertices, faces, process=False)).faces
     sides = np.concatenate([found[:, [0, 1]], found[:, [1, 2]], found[:, [2, 0]]])
-    repeated = len(sides) - len(np.unique(sides, axis=0))    # two faces on one side of an edge
+    repeated = len(sides) - len(np.unique(sides, axis=0))  # two faces on one side of an edge
     assert repeated == 1

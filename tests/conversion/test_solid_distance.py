@@ -43,7 +43,7 @@ def test_meshes_that_intersect_are_united():
 
 def test_in_a_thin_plate_the_solid_side_counts():
     cell = LATTICE.spacing
-    top, bottom = 0.5 * cell, -0.7 * cell    # the lattice's vertices at z = 0 are nearer to the top
+    top, bottom = 0.5 * cell, -0.7 * cell  # the lattice's vertices at z = 0 are nearer to the top
     plate = trimesh.creation.box(bounds=[[-0.7, -0.7, bottom], [0.7, 0.7, top]])
     for _ in range(4):
         plate = plate.subdivide()

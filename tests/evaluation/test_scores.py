@@ -76,8 +76,9 @@ def test_noise_lowers_every_score():
     rng = np.random.default_rng(0)
     image = rng.random((32, 32, 4)) * 0.5 + 0.25
     image[..., 3] = 1
-    little, much = (image_scores(image + s * rng.normal(size=image.shape) * [1, 1, 1, 0], image)[0]
-                    for s in (0.01, 0.1))
+    little, much = (
+        image_scores(image + s * rng.normal(size=image.shape) * [1, 1, 1, 0], image)[0] for s in (0.01, 0.1)
+    )
     assert little["psnr"] > much["psnr"] and little["ssim"] > much["ssim"]
     assert all(little[name] < much[name] for name in ("flip", "relative_mse", "delta_e"))
 
@@ -118,7 +119,7 @@ def test_larger_ball(ball):
     assert scores["chamfer"] == pytest.approx(100 * 0.05 / np.sqrt(12), rel=0.06)
     assert scores["f_score"] == 0
     # The winding number differs in the shell, a known fraction of the box of side 2.4.
-    shell = 4 / 3 * np.pi * (1.05 ** 3 - 1) / 2.4 ** 3
+    shell = 4 / 3 * np.pi * (1.05**3 - 1) / 2.4**3
     assert scores["winding_difference"] == pytest.approx(shell, abs=0.008)
 
 
@@ -127,7 +128,7 @@ def test_turned_inside_out(ball):
     inverted.invert()
     scores = mesh_scores(inverted, ball, samples=20000)
     assert scores["normal_consistency"] > 0.999, "of unoriented normals"
-    assert scores["winding_difference"] == pytest.approx(2 * 4 / 3 * np.pi / 2.4 ** 3, abs=0.03)
+    assert scores["winding_difference"] == pytest.approx(2 * 4 / 3 * np.pi / 2.4**3, abs=0.03)
 
 
 def test_winding_number_of_an_open_surface(ball):

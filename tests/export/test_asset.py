@@ -48,12 +48,19 @@ def validate(tmp_path_factory):
         pytest.skip("node and npm are not installed: the GLB is not validated")
     folder = tmp_path_factory.mktemp("validator")
     try:
-        subprocess.run(["npm", "install", "--silent", "--no-audit", "--no-fund", VALIDATOR], cwd=folder,
-                       check=True, capture_output=True, timeout=120)
+        subprocess.run(
+            ["npm", "install", "--silent", "--no-audit", "--no-fund", VALIDATOR],
+            cwd=folder,
+            check=True,
+            capture_output=True,
+            timeout=120,
+        )
     except (subprocess.SubprocessError, OSError):
         pytest.skip("npm cannot install gltf-validator: the GLB is not validated")
-    script = ("require('gltf-validator').validateBytes(new Uint8Array(require('fs').readFileSync("
-              "process.argv[1]))).then(r => console.log(JSON.stringify(r.issues)))")
+    script = (
+        "require('gltf-validator').validateBytes(new Uint8Array(require('fs').readFileSync("
+        "process.argv[1]))).then(r => console.log(JSON.stringify(r.issues)))"
+    )
 
     def run(path) -> dict:
         found = subprocess.run(["node", "-e", script, str(path)], cwd=folder, check=True, capture_output=True)
@@ -72,11 +79,13 @@ def read_attributes(path, *names: str) -> list[np.ndarray]:
     """Arrays of shape (V, 3) of the first primitive, straight from the file."""
     data = path.read_bytes()
     length = int.from_bytes(data[12:16], "little")
-    document, binary = json.loads(data[20:20 + length]), data[28 + length:]
+    document, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     views = [document["bufferViews"][document["accessors"][attributes[name]]["bufferView"]] for name in names]
-    return [np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(-1, 3)
-            for view in views]
+    return [
+        np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(-1, 3)
+        for view in views
+    ]
 
 
 def sample(image, uv: np.ndarray) -> np.ndarray:
@@ -137,8 +146,9 @@ def test_normal_texture_restores_the_fine_normals(asset):
     tangents = vertex_tangents(np.asarray(mesh.vertices), normals, np.asarray(mesh.faces), uv)
     local = 2 * sample(mesh.visual.material.normalTexture, blend(uv)) - 1
     bitangents = tangents[:, 3:] * np.cross(normals, tangents[:, :3])
-    shaded = sum(local[:, i:i + 1] * blend(axis) for i, axis in
-                 enumerate((tangents[:, :3], bitangents, normals)))
+    shaded = sum(
+        local[:, i : i + 1] * blend(axis) for i, axis in enumerate((tangents[:, :3], bitangents, normals))
+    )
     shaded /= np.linalg.norm(shaded, axis=1, keepdims=True)
     angle = np.degrees(np.arccos((shaded * bumpy(points)).sum(1).clip(-1, 1)))
     plain = np.degrees(np.arccos((blend(normals) * bumpy(points)).sum(1).clip(-1, 1)))
@@ -197,8 +207,8 @@ def test_openness_of_a_bowl():
     bottom = ball.vertices[:, 1].argmin()
     rim = ball.vertices[:, 1].max()
     # A disc on the axis, seen from the pole: sin² of its half-angle.
-    radius = np.sqrt(RADIUS ** 2 - rim ** 2)
-    expected = radius ** 2 / (radius ** 2 + (rim + RADIUS) ** 2)
+    radius = np.sqrt(RADIUS**2 - rim**2)
+    expected = radius**2 / (radius**2 + (rim + RADIUS) ** 2)
     neighbours = np.linalg.norm(ball.vertices - ball.vertices[bottom], axis=1) < 0.1
     assert openness(inward)[neighbours].mean() == pytest.approx(expected, abs=0.04)
     assert openness(ball).min() > 0.95
@@ -219,10 +229,12 @@ def test_atlas_covers_every_face_without_overlap():
     for t in atlas.uv[atlas.faces] * size:
         low, high = np.floor(t.min(0)).astype(int), np.ceil(t.max(0)).astype(int)
         x, y = np.meshgrid(np.arange(low[0], high[0]) + 0.5, np.arange(low[1], high[1]) + 0.5)
-        edge = [(t[(i + 1) % 3, 0] - t[i, 0]) * (y - t[i, 1]) - (t[(i + 1) % 3, 1] - t[i, 1]) * (x - t[i, 0])
-                for i in range(3)]
+        edge = [
+            (t[(i + 1) % 3, 0] - t[i, 0]) * (y - t[i, 1]) - (t[(i + 1) % 3, 1] - t[i, 1]) * (x - t[i, 0])
+            for i in range(3)
+        ]
         inside = np.all(np.array(edge) > 0, 0) | np.all(np.array(edge) < 0, 0)
-        covered[low[1]:high[1], low[0]:high[0]] += inside
+        covered[low[1] : high[1], low[0] : high[0]] += inside
     assert covered.max() == 1
 
 
@@ -231,14 +243,17 @@ def test_command(fit, capsys):
     assert "faces" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments, message", [
-    ((), "does not exist; give the folder of a finished fit"),
-    (("--texture-size", "0"), "--texture-size must be at least 16 pixels"),
-    (("--face-count", "-1"), "--face-count must not be negative"),
-    (("--min-quality", "1.5"), "--min-quality lies between 0 and 1"),
-    (("--texture-size", "1000000"), "GiB are free; lower --texture-size"),
-    (("--unwrap-seconds", "nan"), "--unwrap-seconds lies between 0 and"),
-])
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ((), "does not exist; give the folder of a finished fit"),
+        (("--texture-size", "0"), "--texture-size must be at least 16 pixels"),
+        (("--face-count", "-1"), "--face-count must not be negative"),
+        (("--min-quality", "1.5"), "--min-quality lies between 0 and 1"),
+        (("--texture-size", "1000000"), "GiB are free; lower --texture-size"),
+        (("--unwrap-seconds", "nan"), "--unwrap-seconds lies between 0 and"),
+    ],
+)
 def test_mistakes(tmp_path, capsys, arguments, message):
     assert command.main([str(tmp_path / "none"), *arguments]) == 2
     error = capsys.readouterr().err
@@ -246,8 +261,12 @@ def test_mistakes(tmp_path, capsys, arguments, message):
 
 
 def test_empty_mesh(tmp_path):
-    empty = FittedMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)),
-                       {"color": np.zeros((0, 3)), "roughness": np.zeros(0), "metallic": np.zeros(0)})
+    empty = FittedMesh(
+        np.zeros((0, 3)),
+        np.zeros((0, 3), int),
+        np.zeros((0, 3)),
+        {"color": np.zeros((0, 3)), "roughness": np.zeros(0), "metallic": np.zeros(0)},
+    )
     write_fit(tmp_path, empty)
     with pytest.raises(UserError, match="is empty; there is nothing to export"):
         write_asset(tmp_path)

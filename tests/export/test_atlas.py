@@ -6,7 +6,7 @@ import trimesh
 
 from gshell_mi.export.atlas import unwrap
 
-BALL = trimesh.creation.icosphere(subdivisions=4)    # 5120 faces
+BALL = trimesh.creation.icosphere(subdivisions=4)  # 5120 faces
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1e-3, 1e5])

@@ -82,7 +82,7 @@ def test_a_texture_is_on_the_divided_mesh(exported, tmp_path):
     divided = trimesh.load(tmp_path / "mesh.ply", process=False)
     assert len(divided.faces) == 4 * len(faces) == metrics["counts"]["faces"]
     assert loop_count(divided.faces) == metrics["counts"]["boundary_loops"] == 1
-    np.testing.assert_allclose(np.asarray(divided.vertices)[:len(whole)], whole, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(divided.vertices)[: len(whole)], whole, atol=1e-6)
     np.testing.assert_allclose(attribute(divided, "color", 3), texture, atol=1e-6)
     np.testing.assert_allclose(attribute(divided, "roughness", 1), 0.3, atol=1e-5)
 
@@ -137,7 +137,8 @@ def test_scene_is_the_fitted_one(exported):
     scene = mi.load_file(str(exported.output / "scene.xml"))
     assert [shape.class_name() for shape in scene.shapes()] == ["PLYMesh"]
     assert [sensor.id() for sensor in scene.sensors()] == [
-        name for i in range(VIEWS) if (name := f"view_{i:03}") not in HELD_OUT]
+        name for i in range(VIEWS) if (name := f"view_{i:03}") not in HELD_OUT
+    ]
     sensor, first = scene.sensors()[0], exported.fit.sensors[0]
     assert sensor.id() == first.id() == "view_001"
     film = mi.Point2f([0.1, 0.5, 0.9], [0.3, 0.5, 0.8])
@@ -154,8 +155,12 @@ def test_scene_is_the_fitted_one(exported):
 
 SENSORS = {
     "fov along y": {"type": "perspective", "fov": 50, "fov_axis": "y"},
-    "principal point": {"type": "perspective", "fov": 35, "principal_point_offset_x": 0.1,
-                        "principal_point_offset_y": -0.2},
+    "principal point": {
+        "type": "perspective",
+        "fov": 35,
+        "principal_point_offset_x": 0.1,
+        "principal_point_offset_y": -0.2,
+    },
     "thin lens": {"type": "thinlens", "fov": 35, "aperture_radius": 0.1, "focus_distance": 2.5},
 }
 
@@ -167,8 +172,10 @@ def test_any_perspective_sensor_survives(exported, tmp_path, kind, crop):
     if crop:
         film |= {"crop_width": 20, "crop_height": 12, "crop_offset_x": 30, "crop_offset_y": 9}
     to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0.1, 0, 0], [0, 1, 0])
-    sensor = mi.load_dict(SENSORS[kind] | {"to_world": to_world, "film": film, "id": 'view "7" & <8>',
-                                           "near_clip": 2e-6, "far_clip": 3e7})
+    sensor = mi.load_dict(
+        SENSORS[kind]
+        | {"to_world": to_world, "film": film, "id": 'view "7" & <8>', "near_clip": 2e-6, "far_clip": 3e7}
+    )
     for name in ("mesh.ply", "light.exr"):
         (tmp_path / name).write_bytes((exported.output / name).read_bytes())
     write_scene(tmp_path / "scene.xml", exported.fit.light, [sensor])
@@ -190,10 +197,14 @@ def look(emitter) -> np.ndarray:
     return np.broadcast_to(np.array(emitter.eval(si)), (3, 200))
 
 
-@pytest.mark.parametrize("light", [
-    {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1.0, 2.0]}},
-    {"type": "envmap", "scale": 2.0, "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 70)},
-], ids=["constant", "rotated map"])
+@pytest.mark.parametrize(
+    "light",
+    [
+        {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 1.0, 2.0]}},
+        {"type": "envmap", "scale": 2.0, "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 70)},
+    ],
+    ids=["constant", "rotated map"],
+)
 @pytest.mark.parametrize("optimised", [False, True])
 def test_light_survives(exported, tmp_path, light, optimised):
     if light["type"] == "envmap":
@@ -224,8 +235,9 @@ def test_ids_are_escaped(exported, tmp_path):
 
 def test_the_mark_lists_what_was_written(exported):
     found = OwnFolder(exported.output, "fit")
-    there = {path.relative_to(exported.output).as_posix() for path in exported.output.rglob("*")
-             if path.is_file()}
+    there = {
+        path.relative_to(exported.output).as_posix() for path in exported.output.rglob("*") if path.is_file()
+    }
     assert found.files == there - {MARK} >= {"mesh.ply", "scene.xml", "metrics.json", "views/view_001.png"}
 
 
@@ -263,8 +275,9 @@ def test_scores_are_those_of_the_pictures(exported, entry, names):
         target, shown, _ = np.split(np.array(Image.open(folder / f"{name}.png")) / 255, 3, axis=1)
         assert found["psnr"] == pytest.approx(psnr(shown, target), abs=0.1)
         overlay = np.array(Image.open(exported.output / "masks" / f"{name}.png")) / 255
-        both, *others = (np.isclose(overlay, color, atol=1 / 255).all(-1).sum()
-                         for color in (BOTH, MASK_ONLY, FIT_ONLY))
+        both, *others = (
+            np.isclose(overlay, color, atol=1 / 255).all(-1).sum() for color in (BOTH, MASK_ONLY, FIT_ONLY)
+        )
         assert found["mask_iou"] == pytest.approx(both / (both + sum(others)), abs=1e-4)
     for score in VIEW_SCORES:
         mean = np.mean([found[score] for found in scores["views"].values()])
@@ -274,10 +287,17 @@ def test_scores_are_those_of_the_pictures(exported, entry, names):
 def test_the_light_turns_with_held_out_cameras_too(exported, tmp_path, monkeypatch):
     """As seen from the first training view."""
     given = {}
-    monkeypatch.setattr(fit_folder, "write_views", lambda output, folder, views, lights, _: given.update(
-        {view.sensor.id(): np.array(light.matrix) for view, light in zip(views, lights, strict=True)})
-        or {"views": {}, "mean": {"psnr": 0.0}})
-    many = 10**12    # of which there are not so many
+    monkeypatch.setattr(
+        fit_folder,
+        "write_views",
+        lambda output, folder, views, lights, _: (
+            given.update(
+                {view.sensor.id(): np.array(light.matrix) for view, light in zip(views, lights, strict=True)}
+            )
+            or {"views": {}, "mean": {"psnr": 0.0}}
+        ),
+    )
+    many = 10**12  # of which there are not so many
     export_fit(tmp_path, exported.fit, exported.joint.material, exported.joint.light, many, light_turns=True)
     first = exported.fit.sensors[0]
     assert len(given) == VIEWS
@@ -294,8 +314,10 @@ def test_views_are_exposed_as_their_targets(exported, tmp_path):
     told = export_fit(tmp_path, exported.fit, exported.joint.material, exported.joint.light, 2, gains=gains)
     assert told["exposures"]["gains"][exported.fit.sensors[0].id()] == [0.25, 1, 1]
     assert told["exposures"]["stops"][last] == -1 and list(told["exposures"]["stops"].values()).count(0) > 1
-    before, after = (np.array(Image.open(folder / "views" / "view_001.png"))[:, SIZE:2 * SIZE].astype(int)
-                     for folder in (exported.output, tmp_path))
+    before, after = (
+        np.array(Image.open(folder / "views" / "view_001.png"))[:, SIZE : 2 * SIZE].astype(int)
+        for folder in (exported.output, tmp_path)
+    )
     object_ = before.min(axis=-1) < 250
     assert (after[object_, 0] < 0.8 * before[object_, 0]).mean() > 0.8
     assert np.abs(after[..., 1:] - before[..., 1:]).mean() < 5
@@ -318,7 +340,10 @@ def test_mesh_round_trip(exported, mesh, tmp_path):
     np.testing.assert_array_equal(read.vertices, mesh.vertices)
     np.testing.assert_array_equal(read.faces, mesh.faces)
     assert {name: values.shape[1:] for name, values in read.attributes.items()} == {
-        "color": (3,), "roughness": (), "metallic": ()}
+        "color": (3,),
+        "roughness": (),
+        "metallic": (),
+    }
     write_ply(tmp_path / "again.ply", read.vertices, read.faces, read.normals, read.attributes)
     again = read_ply(tmp_path / "again.ply")
     np.testing.assert_array_equal(again.attributes["color"], read.attributes["color"])
@@ -353,6 +378,15 @@ def test_empty_mesh(tmp_path):
 def test_up_axis(axis, up):
     # One view from above tells nothing about the others' up.
     rng = np.random.default_rng(axis)
-    sensors = [mi.load_dict({"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(
-        list(rng.normal(size=3) + 2 * up), [0, 0, 0], list(up))}) for _ in range(12)]
+    sensors = [
+        mi.load_dict(
+            {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at(
+                    list(rng.normal(size=3) + 2 * up), [0, 0, 0], list(up)
+                ),
+            }
+        )
+        for _ in range(12)
+    ]
     assert up_axis(sensors) == axis

@@ -15,8 +15,11 @@ from gshell_mi.own_folder import MARK, OwnFolder
 
 def files(folder: Path) -> dict[str, str]:
     """What is in a folder, by name, but the mark."""
-    return {path.relative_to(folder).as_posix(): path.read_text() for path in sorted(folder.rglob("*"))
-            if path.is_file() and path.name != MARK}
+    return {
+        path.relative_to(folder).as_posix(): path.read_text()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != MARK
+    }
 
 
 def write(folder: Path, **contents: str) -> None:
@@ -69,8 +72,13 @@ def test_the_earlier_fit_stays_whole_until_the_new_one_is(earlier):
         write(folder.place, mesh="new", views_a="new")
         assert {name: text for name, text in files(earlier).items() if ".unfinished" not in name} == before
         folder.finish()
-    assert files(earlier) == {"mesh.ply": "new", "checkpoint.npz": "new", "views/a.png": "new",
-                              "notes.txt": "mine", "views/holiday.jpg": "mine"}
+    assert files(earlier) == {
+        "mesh.ply": "new",
+        "checkpoint.npz": "new",
+        "views/a.png": "new",
+        "notes.txt": "mine",
+        "views/holiday.jpg": "mine",
+    }
     assert OwnFolder(earlier, "fit").files == {"mesh.ply", "checkpoint.npz", "views/a.png"}
     assert not list(earlier.glob(".*"))
 
@@ -132,8 +140,13 @@ def test_killed_while_the_new_files_move_in(earlier, monkeypatch, killed_after):
         folder.prepare()
         write(folder.place, mesh="new", checkpoint="new", views_a="new")  # a resumed fit exports again
         folder.finish()
-    assert files(earlier) == {"mesh.ply": "new", "checkpoint.npz": "new", "views/a.png": "new",
-                              "notes.txt": "mine", "views/holiday.jpg": "mine"}
+    assert files(earlier) == {
+        "mesh.ply": "new",
+        "checkpoint.npz": "new",
+        "views/a.png": "new",
+        "notes.txt": "mine",
+        "views/holiday.jpg": "mine",
+    }
     assert not list(earlier.glob(".*"))
 
 
@@ -143,8 +156,10 @@ def test_what_no_fit_wrote_is_in_the_way(tmp_path, name, overwrite):
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("precious")
     before = files(tmp_path)
-    with (pytest.raises(UserError, match=f"{name}' is in the way: gshell_mi.fit has not written it there"),
-          FitFolder(tmp_path, resume=False, overwrite=overwrite) as folder):
+    with (
+        pytest.raises(UserError, match=f"{name}' is in the way: gshell_mi.fit has not written it there"),
+        FitFolder(tmp_path, resume=False, overwrite=overwrite) as folder,
+    ):
         folder.check([], ["a"])
         folder.prepare()
     assert files(tmp_path) == before and not (tmp_path / MARK).exists()
@@ -161,16 +176,28 @@ def test_a_link_is_never_written_through(earlier, tmp_path):
     away = tmp_path / "away"
     (earlier / "views").rename(away)
     (earlier / "views").symlink_to(away)
-    with (pytest.raises(UserError, match="views' is in the way"),
-          FitFolder(earlier, resume=False, overwrite=True) as folder):
+    with (
+        pytest.raises(UserError, match="views' is in the way"),
+        FitFolder(earlier, resume=False, overwrite=True) as folder,
+    ):
         folder.check([], ["a"])
         folder.prepare()
     assert set(files(away)) == {"a.png", "b.png", "holiday.jpg"} and precious.read_text() == "precious"
 
 
-@pytest.mark.parametrize("mark", [
-    '{"kind": "fit", "files": ["../precious.txt", "notes.txt", "/etc/hostname", "views/../notes.txt", 5]}',
-    '{"kind": "fit", "files": "notes.txt"}', "[]", "5", "{", '{"kind": ["fit"]}', "[" * 100_000, "\udc80"])
+@pytest.mark.parametrize(
+    "mark",
+    [
+        '{"kind": "fit", "files": ["../precious.txt", "notes.txt", "/etc/hosts", "views/../notes.txt", 5]}',
+        '{"kind": "fit", "files": "notes.txt"}',
+        "[]",
+        "5",
+        "{",
+        '{"kind": ["fit"]}',
+        "[" * 100_000,
+        "\udc80",
+    ],
+)
 def test_a_strangers_mark_is_not_believed(tmp_path, mark):
     """Only names that a fit writes are ever removed, whatever the mark lists."""
     output = tmp_path / "out"
@@ -200,8 +227,10 @@ def test_inputs_are_not_replaced(earlier, tmp_path, link):
         given = tmp_path / "given.ply"
         given.symlink_to(earlier / "mesh.ply")
     before = files(earlier)
-    with (pytest.raises(UserError, match=f"{given.name}' is read by this run and would be replaced by it"),
-          FitFolder(earlier, resume=False, overwrite=True) as folder):
+    with (
+        pytest.raises(UserError, match=f"{given.name}' is read by this run and would be replaced by it"),
+        FitFolder(earlier, resume=False, overwrite=True) as folder,
+    ):
         folder.check([given], ["a"])
         folder.prepare()
     assert files(earlier) == before
@@ -246,8 +275,10 @@ def test_nothing_goes_where_not_all_can_go(earlier):
     before = files(earlier)
     (earlier / "views").chmod(0o500)
     try:
-        with (pytest.raises(UserError, match=r"views' cannot be written \(Permission denied\)"),
-              FitFolder(earlier, resume=False, overwrite=True) as folder):
+        with (
+            pytest.raises(UserError, match=r"views' cannot be written \(Permission denied\)"),
+            FitFolder(earlier, resume=False, overwrite=True) as folder,
+        ):
             folder.check([], ["a"])
             folder.prepare()
     finally:

@@ -54,6 +54,8 @@ def interpolated(vertices: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def test_stock_mitsuba_interpolates_over_what_is_written():
     x = np.linspace(0.1, 0.9, 100)
-    off = [np.abs(interpolated(vertices, x) - x).max()
-           for vertices in (fan(1e-5), without_slivers(fan(1e-5), FACES, NORMALS))]
+    off = [
+        np.abs(interpolated(vertices, x) - x).max()
+        for vertices in (fan(1e-5), without_slivers(fan(1e-5), FACES, NORMALS))
+    ]
     assert not off[0] < 0.1 and off[1] < 0.03

@@ -23,10 +23,14 @@ def move():
 
 def _both(move):
     """Stored vertices of after that before has too, and where they are in it."""
-    ids = [lattice.lattice_vertex(dr.arange(mi.UInt32, lattice.vertex_count)).numpy()
-           for lattice in (move.before, move.after)]
-    exists = [np.unpackbits(lattice.exists.numpy().view(np.uint8), bitorder="little").astype(bool)
-              for lattice in (move.before, move.after)]
+    ids = [
+        lattice.lattice_vertex(dr.arange(mi.UInt32, lattice.vertex_count)).numpy()
+        for lattice in (move.before, move.after)
+    ]
+    exists = [
+        np.unpackbits(lattice.exists.numpy().view(np.uint8), bitorder="little").astype(bool)
+        for lattice in (move.before, move.after)
+    ]
     kept = np.isin(ids[1], ids[0][exists[0]]) & exists[1]
     where = np.searchsorted(ids[0][exists[0]], ids[1][kept])
     return kept, np.flatnonzero(exists[0])[where], exists[1]
@@ -75,8 +79,9 @@ def test_signs_at_the_edge_hold():
     p = before.points(mi.Float)
     flipped = dr.select(dr.abs(p.x) < 0.9, -dr.abs(_ball(p, 0.3)) - 0.01, 1)  # open at the lattice's border
     assert not before.covers(extract(before, flipped).cells)
-    after = before.around_cells(extract(before, flipped).cells,
-                                lambda new: Carried(before, new).sdf(flipped), keep=True)
+    after = before.around_cells(
+        extract(before, flipped).cells, lambda new: Carried(before, new).sdf(flipped), keep=True
+    )
     values = Carried(before, after).sdf(flipped)
     mesh = extract(after, values)
     assert mesh.face_count > 1000 and mesh.to_trimesh().is_watertight
@@ -85,15 +90,20 @@ def test_signs_at_the_edge_hold():
 def test_optimizer_state_is_carried_per_block(move):
     rng = np.random.default_rng(1)
     n = move.before.vertex_count
-    start = {"sdf": _ball(move.before.points(mi.Float), 0.3), "deform": mi.Float(rng.normal(size=3 * n)),
-             "light": mi.Float(1, 2, 3)}
+    start = {
+        "sdf": _ball(move.before.points(mi.Float), 0.3),
+        "deform": mi.Float(rng.normal(size=3 * n)),
+        "light": mi.Float(1, 2, 3),
+    }
     optimizer = mi.ad.Adam(lr=0.01, params=start)
     for _ in range(3):
         for name in start:
             dr.set_grad(optimizer[name], mi.Float(rng.normal(size=dr.width(start[name]))))
         optimizer.step()
-    before = {name: (value.numpy(), first.numpy(), second.numpy())
-              for name, (value, _, _, (_, first, second, _)) in optimizer.state.items()}
+    before = {
+        name: (value.numpy(), first.numpy(), second.numpy())
+        for name, (value, _, _, (_, first, second, _)) in optimizer.state.items()
+    }
     move.optimizer(optimizer, ("sdf", "deform"))
     kept, where, exists = _both(move)
     for name, channels in (("sdf", 1), ("deform", 3)):

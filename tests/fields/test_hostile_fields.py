@@ -15,8 +15,10 @@ def archive(tmp_path):
         sphere(TetLattice(32), in_blocks=True).save(tmp_path / "a.npz")
         with np.load(tmp_path / "a.npz") as stored:
             arrays = dict(stored)
-        np.savez(tmp_path / "a.npz", **{name: changes.get(name, lambda x: x)(value)
-                                        for name, value in arrays.items()})
+        np.savez(
+            tmp_path / "a.npz",
+            **{name: changes.get(name, lambda x: x)(value) for name, value in arrays.items()},
+        )
         return tmp_path / "a.npz"
 
     return write
@@ -27,17 +29,22 @@ def test_untouched_fields_come_back(archive):
     assert fields.lattice.vertex_count == fields.sdf.size > 0
 
 
-@pytest.mark.parametrize("changes, words", [
-    ({"blocks": lambda x: x + 10**6}, "its blocks are not ascending whole numbers below"),
-    ({"blocks": lambda x: x[::-1]}, "not ascending"), ({"blocks": lambda x: x * 0}, "not ascending"),
-    ({"blocks": lambda x: x - 0.5}, "not ascending"), ({"blocks": lambda x: x[:0]}, "not ascending"),
-    ({"block_resolution": lambda x: x * 0}, "no block_resolution from 1 to 800"),
-    ({"block_resolution": lambda x: x + 10**6}, "no block_resolution"),
-    ({"block_resolution": lambda x: np.array([8, 8])}, "no block_resolution"),
-    ({"sdf": lambda x: x * np.nan}, "sdf holds NaN or infinity"),
-    ({"sdf": lambda x: np.full(x.shape, "a")}, "cannot be read as an .npz archive"),
-    ({"msdf": lambda x: np.full_like(x, np.inf)}, "msdf holds NaN or infinity"),
-])
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"blocks": lambda x: x + 10**6}, "its blocks are not ascending whole numbers below"),
+        ({"blocks": lambda x: x[::-1]}, "not ascending"),
+        ({"blocks": lambda x: x * 0}, "not ascending"),
+        ({"blocks": lambda x: x - 0.5}, "not ascending"),
+        ({"blocks": lambda x: x[:0]}, "not ascending"),
+        ({"block_resolution": lambda x: x * 0}, "no block_resolution from 1 to 800"),
+        ({"block_resolution": lambda x: x + 10**6}, "no block_resolution"),
+        ({"block_resolution": lambda x: np.array([8, 8])}, "no block_resolution"),
+        ({"sdf": lambda x: x * np.nan}, "sdf holds NaN or infinity"),
+        ({"sdf": lambda x: np.full(x.shape, "a")}, "cannot be read as an .npz archive"),
+        ({"msdf": lambda x: np.full_like(x, np.inf)}, "msdf holds NaN or infinity"),
+    ],
+)
 def test_what_is_refused(changes, words, archive):
     with pytest.raises(UserError, match=words):
         fields = LatticeFields.load(archive(**changes))

@@ -63,8 +63,9 @@ def test_unreadable(tmp_path):
             LatticeFields.load(tmp_path / name)
 
 
-@pytest.mark.parametrize(("resolution", "grid"),
-                         [(4, "tet"), (5, "tet"), (8, "tet"), (16, "tet"), (8, "cube"), (6, "bcc")])
+@pytest.mark.parametrize(
+    ("resolution", "grid"), [(4, "tet"), (5, "tet"), (8, "tet"), (16, "tet"), (8, "cube"), (6, "bcc")]
+)
 def test_resampling_keeps_linear_fields_and_lengths(resolution, grid):
     old, new = TetLattice(8), make_lattice(grid, resolution)
     p = old.vertex_positions()

@@ -34,7 +34,7 @@ def test_holes_are_filled_on_request():
 @pytest.mark.parametrize("shares", [(0.3,), (0.15, 0.2), (0.05, 0.3, 0.05), (0.02,)])
 def test_a_sheet_seen_edge_on_counts_as_a_pixel_wide(shares):
     alpha = np.zeros((32, 32))
-    alpha[4:28, 16:16 + len(shares)] = shares
+    alpha[4:28, 16 : 16 + len(shares)] = shares
     assert (mask_distance(alpha) > 0).all()
     distance = mask_distance(alpha, thin_parts=True)
     peak = 16 + int(np.argmax(shares))

@@ -27,8 +27,9 @@ def solve(field: np.ndarray, smoothing: float) -> np.ndarray:
     """(I + smoothing L)^-1 with the combinatorial Laplacian of the N^3 grid."""
     line = sp.diags([np.ones(N - 1), np.ones(N - 1)], [-1, 1])
     one = sp.eye(N)
-    adjacency = (sp.kron(sp.kron(line, one), one) + sp.kron(sp.kron(one, line), one)
-                 + sp.kron(sp.kron(one, one), line))
+    adjacency = (
+        sp.kron(sp.kron(line, one), one) + sp.kron(sp.kron(one, line), one) + sp.kron(sp.kron(one, one), line)
+    )
     return spsolve((sp.eye(N**3) + smoothing * sp.csgraph.laplacian(adjacency)).tocsc(), field)
 
 
@@ -83,6 +84,7 @@ def test_channels_do_not_mix(field):
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 def test_fields_that_are_added_to_just_before(count):
     """As gradients are; any number of them together is what each is alone."""
+
     def spike(at):
         field = dr.zeros(mi.Float, N**3)
         dr.scatter_reduce(dr.ReduceOp.Add, field, mi.Float(1), mi.UInt32(at))
@@ -151,9 +153,11 @@ def surface_cells(lattice: Lattice) -> mi.UInt32:
     return active_cells(dr.minimum(0.6 * p.x + 0.3 * p.y - 0.7 * p.z + 0.4, ball), lattice)[0]
 
 
-@pytest.mark.parametrize("lattice", [make_lattice(grid, n) for grid, n in
-                                     (("tet", 13), ("cube", 31), ("flexicubes", 10), ("bcc", 12))],
-                         ids=lambda lattice: lattice.grid)
+@pytest.mark.parametrize(
+    "lattice",
+    [make_lattice(grid, n) for grid, n in (("tet", 13), ("cube", 31), ("flexicubes", 10), ("bcc", 12))],
+    ids=lambda lattice: lattice.grid,
+)
 @pytest.mark.parametrize("reach", [1, 3, 5])
 def test_vertices_near_cells(lattice: Lattice, reach: int):
     """All that are in reach, and nearly none that is a good deal farther."""
@@ -212,8 +216,10 @@ def test_a_mesh_is_solved_exactly_and_all_fields_together():
     system = sp.eye(count) + 7.0 * sp.csgraph.laplacian(adjacency + adjacency.T)
     diffuse = MeshDiffusion(sphere.faces, count, 7.0)
     random = np.random.default_rng(0)
-    fields = {name: random.normal(size=(count, channels)).astype(np.float32)
-              for name, channels in (("logit", 1), ("front", 3), ("back", 3), ("gloss", 1), ("pair", 2))}
+    fields = {
+        name: random.normal(size=(count, channels)).astype(np.float32)
+        for name, channels in (("logit", 1), ("front", 3), ("back", 3), ("gloss", 1), ("pair", 2))
+    }
     given = {name: mi.Float(field.ravel()) for name, field in fields.items()}
     together = diffuse.together(given)
     assert list(together) == list(fields) and diffuse.together({}) == {}

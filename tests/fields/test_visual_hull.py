@@ -29,8 +29,12 @@ def around(count: int, size: int = 64) -> PinholeViews:
     y, angle = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
     origins = 3 * np.stack([np.sqrt(1 - y**2) * np.cos(angle), y, np.sqrt(1 - y**2) * np.sin(angle)], axis=1)
     poses = [look_at(origin, size) for origin in origins]
-    return PinholeViews(tuple(map(str, range(count))), np.full((count, 2), size),
-                        np.array([origin for origin, _ in poses]), np.array([basis for _, basis in poses]))
+    return PinholeViews(
+        tuple(map(str, range(count))),
+        np.full((count, 2), size),
+        np.array([origin for origin, _ in poses]),
+        np.array([basis for _, basis in poses]),
+    )
 
 
 def coverage(views: PinholeViews, index: int, hit, samples: int = 4) -> np.ndarray:
@@ -54,6 +58,7 @@ def sphere_hit(radius: float):
 
 def torus_hit(major: float, minor: float):
     """Rays that come nearer than the surface to a torus around the y axis, by sphere tracing."""
+
     def hit(origin, direction):
         t = np.full(len(direction), 1.5)
         for _ in range(80):

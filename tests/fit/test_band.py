@@ -21,8 +21,15 @@ from gshell_mi.material import MaterialField
 from gshell_mi.scene import load_fit_scene
 
 LATTICE = TetLattice(70)
-CONFIG = FitConfig(iterations=10).changed({"render.spp": 1, "render.primal_spp": 1, "render.max_depth": 2,
-                                           "model.light_height": 4, "joint.warmup": 0.0})
+CONFIG = FitConfig(iterations=10).changed(
+    {
+        "render.spp": 1,
+        "render.primal_spp": 1,
+        "render.max_depth": 2,
+        "model.light_height": 4,
+        "joint.warmup": 0.0,
+    }
+)
 
 
 @pytest.fixture(scope="module")
@@ -44,15 +51,24 @@ def stage(fit, fields: LatticeFields, settings: dict | None = None) -> JointStag
 
 def test_a_step_is_that_on_the_whole_lattice(fit):
     """Gradients that are not smoothed do not know how far the lattice goes on."""
-    rough = {"joint.geometry_smoothing": 1e-12, "joint.geometry_detail": 1e-12,
-             "joint.material_smoothing": 0.0}
+    rough = {
+        "joint.geometry_smoothing": 1e-12,
+        "joint.geometry_detail": 1e-12,
+        "joint.material_smoothing": 0.0,
+    }
     dense, stored = bowl(), bowl().in_blocks()
     after = {}
     for name, fields in (("dense", dense), ("stored", stored)):
         joint = stage(fit, fields, rough)
         losses = joint.step(0)
-        after[name] = losses, {key: optimizer.state[key] for optimizer in joint.optimizers.values()
-                               for key in optimizer.keys()}
+        after[name] = (
+            losses,
+            {
+                key: optimizer.state[key]
+                for optimizer in joint.optimizers.values()
+                for key in optimizer.keys()
+            },
+        )
     assert after["dense"][0] == pytest.approx(after["stored"][0], rel=1e-4)
     blocks = stored.lattice
     everywhere = {"log_radiance", "shared_roughness", "shared_metallic"}
@@ -111,9 +127,26 @@ def test_material_is_carried_to_a_finer_lattice(fit):
 
 def test_a_fit_in_blocks_is_resumed(bowl_scene, tmp_path, monkeypatch):
     output = tmp_path / "out"
-    command = [str(bowl_scene), "-o", str(output), "--quiet", *SHORT, *CLOSED, "--resolution", "40",
-               "--lattice.start-resolution", "16", "--lattice.band-resolution", "32",
-               "--checkpoint-seconds", "0", "--iterations", "2", "--detail.iterations", "4"]
+    command = [
+        str(bowl_scene),
+        "-o",
+        str(output),
+        "--quiet",
+        *SHORT,
+        *CLOSED,
+        "--resolution",
+        "40",
+        "--lattice.start-resolution",
+        "16",
+        "--lattice.band-resolution",
+        "32",
+        "--checkpoint-seconds",
+        "0",
+        "--iterations",
+        "2",
+        "--detail.iterations",
+        "4",
+    ]
     step = JointStage.step
 
     def stopped(self, iteration):

@@ -29,8 +29,15 @@ from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField
 from gshell_mi.scene import load_fit_scene
 
-CONFIG = FitConfig().changed({"lattice.band_resolution": 32,
-    "render.spp": 1, "render.primal_spp": 1, "render.max_depth": 2, "model.light_height": 4})
+CONFIG = FitConfig().changed(
+    {
+        "lattice.band_resolution": 32,
+        "render.spp": 1,
+        "render.primal_spp": 1,
+        "render.max_depth": 2,
+        "model.light_height": 4,
+    }
+)
 
 
 @pytest.mark.parametrize("resolution", [30, 40], ids=["whole lattice", "blocks"])
@@ -39,9 +46,12 @@ def test_it_starts_with_what_the_joint_stage_has_left(bowl_scene, resolution):
     points = lattice.vertex_positions()
     deform = np.sin(3 * points[:, [1, 2, 0]])
     moved = points + lattice.max_offset * deform
-    fields = LatticeFields((np.linalg.norm(moved, axis=1) - RADIUS).astype(np.float32),
-                           (0.1 - moved[:, 1]).astype(np.float32), deform.astype(np.float32).ravel(),
-                           "flexicubes")
+    fields = LatticeFields(
+        (np.linalg.norm(moved, axis=1) - RADIUS).astype(np.float32),
+        (0.1 - moved[:, 1]).astype(np.float32),
+        deform.astype(np.float32).ravel(),
+        "flexicubes",
+    )
     fit.subject.set_fields(fields)
     light = EnvironmentLight.uniform(4, 1.0)
     light.log_radiance = mi.TensorXf(np.random.default_rng(0).normal(size=(4, 8, 3)).astype(np.float32))
@@ -66,8 +76,9 @@ def test_it_starts_with_what_the_joint_stage_has_left(bowl_scene, resolution):
     inside = np.abs(inside).max(axis=1) <= 1
     expected = 0.5 + 0.2 * start.lattice.points(mi.Float).numpy().T
     np.testing.assert_allclose(color[inside], expected[inside], atol=5e-3)
-    np.testing.assert_array_equal(start_light(fit, left, CONFIG).log_radiance.numpy(),
-                                  light.log_radiance.numpy())
+    np.testing.assert_array_equal(
+        start_light(fit, left, CONFIG).log_radiance.numpy(), light.log_radiance.numpy()
+    )
 
 
 def test_its_rates_are_those_of_what_has_settled():
@@ -77,16 +88,30 @@ def test_its_rates_are_those_of_what_has_settled():
     assert after.material_lr < before.material_lr and after.light_lr < before.light_lr
 
 
-@pytest.mark.parametrize(("arguments", "stages"), [
-    (("--iterations", "2", "--detail.iterations", "3"), {"joint": 2, "detail": 3}),
-    (("--iterations", "2", "--detail.iterations", "0"), {"joint": 2}),
-    (("--iterations", "0"), {}),
-    (("--iterations", "2", "--model.field", "multiresolution"), {"joint": 2}),
-    (("--iterations", "2", "--lattice.start-resolution", "24"), {"joint": 2}),
-])
+@pytest.mark.parametrize(
+    ("arguments", "stages"),
+    [
+        (("--iterations", "2", "--detail.iterations", "3"), {"joint": 2, "detail": 3}),
+        (("--iterations", "2", "--detail.iterations", "0"), {"joint": 2}),
+        (("--iterations", "0"), {}),
+        (("--iterations", "2", "--model.field", "multiresolution"), {"joint": 2}),
+        (("--iterations", "2", "--lattice.start-resolution", "24"), {"joint": 2}),
+    ],
+)
 def test_when_there_is_one(bowl_scene, tmp_path, arguments, stages):
-    command = [str(bowl_scene), "-o", str(tmp_path), "--quiet", *SHORT, *CLOSED,
-               "--lattice.start-resolution", "16", "--resolution", "24", *arguments]
+    command = [
+        str(bowl_scene),
+        "-o",
+        str(tmp_path),
+        "--quiet",
+        *SHORT,
+        *CLOSED,
+        "--lattice.start-resolution",
+        "16",
+        "--resolution",
+        "24",
+        *arguments,
+    ]
     assert main(command) == 0
     log = [json.loads(line)["stage"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert {stage: log.count(stage) for stage in ("joint", "detail") if stage in log} == stages
@@ -116,8 +141,10 @@ def test_a_surface_in_blocks_goes_on_in_finer_ones(bowl_scene):
     assert found.settled and found.lattice.resolution == 40
     fine = stage.run(fit, found, Silent())
     assert fine.settled and fine.lattice.resolution == 80 and stage.run(fit, fine, Silent()) is fine
-    radius = [np.linalg.norm(fit.scene.subject.surface_of(each.fields).to_numpy()[0], axis=1)
-              for each in (found, fine)]
+    radius = [
+        np.linalg.norm(fit.scene.subject.surface_of(each.fields).to_numpy()[0], axis=1)
+        for each in (found, fine)
+    ]
     assert len(radius[1]) > 3.5 * len(radius[0])
     cell = fit.cell(found)
     assert np.abs(radius[1] - np.median(radius[0])).max() < 0.5 * cell

@@ -27,10 +27,12 @@ def test_fields_of_the_scene_are_the_start(grid, tmp_path):
     path = write_fit_scene(tmp_path)
     _cut_sphere().save(tmp_path / "start.npz")
     xml = path.read_text()
-    shape = xml[xml.index("<shape"):xml.index("</shape>")]
-    given = ('<shape type="gshell" id="subject"> <string name="filename" value="start.npz"/>'
-             '<bsdf type="principled"> <float name="roughness" value="0.3"/>'
-             '<rgb name="base_color" value="0.2, 0.4, 0.6"/> </bsdf>')
+    shape = xml[xml.index("<shape") : xml.index("</shape>")]
+    given = (
+        '<shape type="gshell" id="subject"> <string name="filename" value="start.npz"/>'
+        '<bsdf type="principled"> <float name="roughness" value="0.3"/>'
+        '<rgb name="base_color" value="0.2, 0.4, 0.6"/> </bsdf>'
+    )
     path.write_text(xml.replace(shape, given))
     output = tmp_path / "out"
     arguments = [str(path), "-o", str(output), "--quiet", *SHORT]
@@ -45,14 +47,21 @@ def test_fields_of_the_scene_are_the_start(grid, tmp_path):
     assert np.linalg.norm(positions, axis=1).max() < 0.6 + 1e-4
     assert abs(positions[:, 1].max() - 0.05) < 0.02
     np.testing.assert_allclose(np.array(parameters["vertex_roughness"]), 0.3, atol=1e-3)
-    np.testing.assert_allclose(np.array(parameters["vertex_color"]).reshape(-1, 3),
-                               np.broadcast_to([0.2, 0.4, 0.6], (len(positions), 3)), atol=1e-3)
+    np.testing.assert_allclose(
+        np.array(parameters["vertex_color"]).reshape(-1, 3),
+        np.broadcast_to([0.2, 0.4, 0.6], (len(positions), 3)),
+        atol=1e-3,
+    )
 
 
 def test_only_a_principled_bsdf_gives_a_material():
     assert given_material(mi.load_dict({"type": "diffuse"})) == {}
-    nested = {"type": "principled", "roughness": 0.25, "metallic": 0.75,
-              "base_color": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}
+    nested = {
+        "type": "principled",
+        "roughness": 0.25,
+        "metallic": 0.75,
+        "base_color": {"type": "rgb", "value": [0.1, 0.2, 0.3]},
+    }
     found = given_material(mi.load_dict({"type": "twosided", "nested": nested}))
     assert (found["roughness"], found["metallic"]) == (0.25, 0.75)
     np.testing.assert_allclose(found["base_color"], [0.1, 0.2, 0.3], atol=1e-6)
@@ -67,7 +76,7 @@ def test_an_environment_map_keeps_its_radiance_and_rotation():
     np.testing.assert_allclose(np.array(light.radiance), image, rtol=1e-3)
     si = mi.SurfaceInteraction3f()
     si.wi = mi.Vector3f([-0.6, 0.3, 0.1], [0.1, -0.4, 0.2], [0.8, 0.5, -0.9])
-    si.wi = si.wi / np.sqrt(np.array(si.wi.x)**2 + np.array(si.wi.y)**2 + np.array(si.wi.z)**2)
+    si.wi = si.wi / np.sqrt(np.array(si.wi.x) ** 2 + np.array(si.wi.y) ** 2 + np.array(si.wi.z) ** 2)
     np.testing.assert_allclose(np.array(light.emitter().eval(si)), np.array(given.eval(si)), rtol=2e-3)
 
 

@@ -36,8 +36,9 @@ def scene(bowl_scene):
 
 def _verdict(scene, before, after, spoil=lambda rgba: rgba) -> Verdict:
     views = PinholeViews.from_sensors(scene.sensors)
-    targets = [dataclasses.replace(target, rgba=spoil(target.rgba).astype(np.float32))
-               for target in scene.targets]
+    targets = [
+        dataclasses.replace(target, rgba=spoil(target.rgba).astype(np.float32)) for target in scene.targets
+    ]
     return Judge(views, targets, Judge.halves(len(views)), batch=16384).decide(before, after)
 
 

@@ -13,8 +13,9 @@ from gshell_mi.light import EnvironmentLight, turns_with_camera
 
 def _camera(angle: float) -> mi.Sensor:
     x, z = 3 * np.sin(angle), 3 * np.cos(angle)
-    return mi.load_dict({"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(
-        [x, 0.0, z], [0, 0, 0], [0, 1, 0])})
+    return mi.load_dict(
+        {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([x, 0.0, z], [0, 0, 0], [0, 1, 0])}
+    )
 
 
 def test_the_light_turns_as_the_camera_does():
@@ -41,8 +42,13 @@ def test_each_view_of_a_turntable_is_explained_by_one_light(bowl_scene, tmp_path
     truth, scene = load_scene(bare.with_suffix("") / "reference.xml"), load_fit_scene(bowl_scene)
     side = np.full((8, 16, 3), 0.02, np.float32)
     side[3:5, 2:6] = 8.0
-    lit = mi.load_dict({"type": "scene", "light": EnvironmentLight(side).emitter(),
-                        **{f"shape_{index}": shape for index, shape in enumerate(truth.shapes())}})
+    lit = mi.load_dict(
+        {
+            "type": "scene",
+            "light": EnvironmentLight(side).emitter(),
+            **{f"shape_{index}": shape for index, shape in enumerate(truth.shapes())},
+        }
+    )
     parameters, folder = mi.traverse(lit), tmp_path / "targets"
     folder.mkdir()
     integrator = mi.load_dict({"type": "path", "max_depth": 3, "hide_emitters": True})
@@ -54,7 +60,20 @@ def test_each_view_of_a_turntable_is_explained_by_one_light(bowl_scene, tmp_path
     scores = {}
     for frame in ("world", "camera"):
         out = tmp_path / frame
-        main([str(bowl_scene), "-o", str(out), "--targets", str(folder), *SHORT, *CLOSED,
-              "--iterations", "60", "--light-frame", frame])
+        main(
+            [
+                str(bowl_scene),
+                "-o",
+                str(out),
+                "--targets",
+                str(folder),
+                *SHORT,
+                *CLOSED,
+                "--iterations",
+                "60",
+                "--light-frame",
+                frame,
+            ]
+        )
         scores[frame] = json.loads((out / "metrics.json").read_text())["psnr_training"]
     assert scores["camera"] > scores["world"] + 1

@@ -20,8 +20,9 @@ SIZES = np.full((48, 2), 256)
 def test_targets_grow_with_pixels_and_the_lattice_with_cells():
     one, two = (MemoryEstimate.of(FitConfig(), 64, np.full((n, 2), 256)) for n in (48, 96))
     assert two.targets == 2 * one.targets and two.samples == one.samples
-    fine = MemoryEstimate.of(FitConfig().changed({"lattice.start_resolution": 128,
-                                                    "lattice.band_resolution": 800}), 128, SIZES)
+    fine = MemoryEstimate.of(
+        FitConfig().changed({"lattice.start_resolution": 128, "lattice.band_resolution": 800}), 128, SIZES
+    )
     assert 4 < fine.lattice / one.lattice < 8, "between the surface and the volume"
     fine, finest = (MemoryEstimate.of(FitConfig(), resolution, SIZES).lattice for resolution in (256, 512))
     assert finest < 4 * fine, "in blocks it follows the surface"
@@ -31,17 +32,27 @@ def test_targets_grow_with_pixels_and_the_lattice_with_cells():
     assert MemoryEstimate.of(FitConfig(), 64, mixed).samples == one.samples * 120000 // 256**2
 
 
-@pytest.mark.parametrize(("config", "resolution", "sizes", "cure"), [
-    (FitConfig(), 512, SIZES, "lower --resolution"),
-    (FitConfig(), 64, np.full((400, 2), 1000), "use fewer or smaller views"),
-    (FitConfig(), 64, np.full((400, 2), 64), "lower --resolution or use fewer views"),
-    (FitConfig(render=RenderConfig(primal_spp=512)), 64, SIZES, "lower --render.primal-spp and --render.spp"),
-    (FitConfig(volume=VolumeConfig(iterations=0)), 16, SIZES[:2], "close other programs"),
-    (FitConfig(), 16, SIZES[:2], "lower --volume.side"),
-    (FitConfig().changed({"model.light_height": 100_000}), 64, SIZES, "lower --model.light-height"),
-    *((FitConfig().changed({name: 10**9}), 64, SIZES, "lower --radiance.batch, --cavities.batch, ")
-      for name in ("radiance.batch", "cavities.batch", "volume.batch", "cameras.places")),
-])
+@pytest.mark.parametrize(
+    ("config", "resolution", "sizes", "cure"),
+    [
+        (FitConfig(), 512, SIZES, "lower --resolution"),
+        (FitConfig(), 64, np.full((400, 2), 1000), "use fewer or smaller views"),
+        (FitConfig(), 64, np.full((400, 2), 64), "lower --resolution or use fewer views"),
+        (
+            FitConfig(render=RenderConfig(primal_spp=512)),
+            64,
+            SIZES,
+            "lower --render.primal-spp and --render.spp",
+        ),
+        (FitConfig(volume=VolumeConfig(iterations=0)), 16, SIZES[:2], "close other programs"),
+        (FitConfig(), 16, SIZES[:2], "lower --volume.side"),
+        (FitConfig().changed({"model.light_height": 100_000}), 64, SIZES, "lower --model.light-height"),
+        *(
+            (FitConfig().changed({name: 10**9}), 64, SIZES, "lower --radiance.batch, --cavities.batch, ")
+            for name in ("radiance.batch", "cavities.batch", "volume.batch", "cameras.places")
+        ),
+    ],
+)
 def test_the_cure_is_for_what_takes_most(config, resolution, sizes, cure):
     estimate = MemoryEstimate.of(config, resolution, sizes)
     estimate.require(estimate.total)

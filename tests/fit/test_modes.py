@@ -21,8 +21,10 @@ from gshell_mi.scene import load_fit_scene
 
 #: The start of the geometry in these tests: a sphere that is too small.
 SMALL = 0.94 * RADIUS
-MATERIAL = ('<bsdf type="principled"> <rgb name="base_color" value="0.3, 0.2, 0.1"/>'
-            '<float name="roughness" value="0.7"/> <float name="metallic" value="0.0"/> </bsdf>')
+MATERIAL = (
+    '<bsdf type="principled"> <rgb name="base_color" value="0.3, 0.2, 0.1"/>'
+    '<float name="roughness" value="0.7"/> <float name="metallic" value="0.0"/> </bsdf>'
+)
 
 
 def fit(scene: Path, output: Path, *arguments: str) -> dict:
@@ -45,8 +47,11 @@ def start_from_sphere(scene: Path, radius: float) -> None:
     points = TetLattice(20).vertex_positions()
     sdf = (np.linalg.norm(points, axis=1) - radius).astype(np.float32)
     LatticeFields(sdf, -points[:, 1], np.zeros(3 * len(sdf), np.float32)).save(scene.parent / "start.npz")
-    scene.write_text(scene.read_text().replace('<integer name="resolution" value="20"/>',
-                                               '<string name="filename" value="start.npz"/>'))
+    scene.write_text(
+        scene.read_text().replace(
+            '<integer name="resolution" value="20"/>', '<string name="filename" value="start.npz"/>'
+        )
+    )
 
 
 def render_targets_with_the_given_material(scene: Path) -> None:
@@ -84,8 +89,9 @@ def test_geometry_only(scene, tmp_path):
     """A bowl that is too small grows, under the given light and material; no mask tells it to."""
     render_targets_with_the_given_material(scene)
     start_from_sphere(scene, SMALL)
-    metrics = fit(scene, tmp_path / "out", "--geometry-only", "--iterations", "30",
-                  "--joint.geometry-lr", "0.4")
+    metrics = fit(
+        scene, tmp_path / "out", "--geometry-only", "--iterations", "30", "--joint.geometry-lr", "0.4"
+    )
     light = np.array(mi.Bitmap(str(tmp_path / "out" / "light.exr")))
     np.testing.assert_allclose(light, 1, rtol=1e-3)
     np.testing.assert_allclose(material(tmp_path / "out")["color_0"], 0.3, atol=1e-6)
@@ -101,6 +107,7 @@ def test_geometry_only_shades_faces_flat(scene):
     from gshell_mi.fit.joint.joint import JointStage
     from gshell_mi.fit.stages.joint import start_light, start_material
     from gshell_mi.fit.surface import Seen, Surface
+
     loaded = load_fit_scene(scene)
     count = loaded.subject.lattice.vertex_count
     surface = Surface(loaded.subject.fields(), seen=Seen(np.zeros((count, 3)), np.zeros(count, bool), 1.0))
@@ -128,8 +135,9 @@ def test_watertight(scene, tmp_path):
 
 def test_watertight_closes_given_openings(scene, tmp_path):
     start_from_sphere(scene, RADIUS)
-    metrics = fit(scene, tmp_path / "out", "--watertight", "--iterations", "0",
-                  "--refinement.iterations", "0")
+    metrics = fit(
+        scene, tmp_path / "out", "--watertight", "--iterations", "0", "--refinement.iterations", "0"
+    )
     assert metrics["counts"]["boundary_loops"] == 0
 
 
@@ -137,8 +145,16 @@ def test_watertight_closes_given_openings(scene, tmp_path):
 def test_all_modes_at_once_resume(scene, tmp_path, weights, monkeypatch):
     """Nothing but sdf, deform and, if asked for, weights is optimised; a checkpoint knows how to go on."""
     output = tmp_path / "out"
-    modes = ("--watertight", "--known-light", "--fixed-material", "--refinement.iterations", "0",
-             *["--model.field", "flexicubes"] * weights, "--iterations", "2")
+    modes = (
+        "--watertight",
+        "--known-light",
+        "--fixed-material",
+        "--refinement.iterations",
+        "0",
+        *["--model.field", "flexicubes"] * weights,
+        "--iterations",
+        "2",
+    )
     command = [str(scene), "-o", str(output), "--quiet", *SHORT, *modes]
     with monkeypatch.context() as patch:
         patch.setattr(JointStage, "finish", _interrupt)

@@ -26,34 +26,45 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
     return [stage.name for stage in stages]
 
 
-@pytest.mark.parametrize(("settings", "expected"), [
-    ({}, ["occlusion", "hull", *START, "volume", "joint", *END]),
-    ({"volume.iterations": 0}, ["occlusion", "hull", *START, "joint", *END]),
-    ({"iterations": 0}, ["occlusion", "hull", *START, "volume", "joint"]),
-    ({"detail.iterations": 0}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
-    ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
-    ({"exposures": "keep"},
-     ["occlusion", "hull", *KEPT, "volume", "joint", *END]),
-    ({"geometry_only": True},
-     ["occlusion", "hull", *KEPT, "volume", "joint", *END]),
-    ({"occlusion.most": 0.0}, ["hull", *START, "volume", "joint", *END]),
-    ({"poses": "keep"}, ["occlusion", "hull", *START, "volume", "joint", "revision", "detail", "texture"]),
-    ({"openings.revise": False},
-     ["occlusion", "hull", *START, "volume", "joint", "poses", "detail", "texture"]),
-    ({"texture.rounds": 0}, ["occlusion", "hull", *START, "volume", "joint", "poses", "revision", "detail"]),
-    ({"model.field": "flexicubes"},
-     ["occlusion", "hull", *START, "volume", "joint", *END]),
-])
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, ["occlusion", "hull", *START, "volume", "joint", *END]),
+        ({"volume.iterations": 0}, ["occlusion", "hull", *START, "joint", *END]),
+        ({"iterations": 0}, ["occlusion", "hull", *START, "volume", "joint"]),
+        ({"detail.iterations": 0}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
+        ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
+        ({"exposures": "keep"}, ["occlusion", "hull", *KEPT, "volume", "joint", *END]),
+        ({"geometry_only": True}, ["occlusion", "hull", *KEPT, "volume", "joint", *END]),
+        ({"occlusion.most": 0.0}, ["hull", *START, "volume", "joint", *END]),
+        (
+            {"poses": "keep"},
+            ["occlusion", "hull", *START, "volume", "joint", "revision", "detail", "texture"],
+        ),
+        (
+            {"openings.revise": False},
+            ["occlusion", "hull", *START, "volume", "joint", "poses", "detail", "texture"],
+        ),
+        (
+            {"texture.rounds": 0},
+            ["occlusion", "hull", *START, "volume", "joint", "poses", "revision", "detail"],
+        ),
+        ({"model.field": "flexicubes"}, ["occlusion", "hull", *START, "volume", "joint", *END]),
+    ],
+)
 def test_stages_from_masks(settings, expected):
     assert names(mi.load_dict({"type": "gshell", "resolution": 12}), settings) == expected
 
 
-@pytest.mark.parametrize(("opened", "settings", "expected"), [
-    (True, {}, ["given", "exposures", "joint", "poses", "detail", "texture"]),
-    (True, {"exposures": "keep"}, ["given", "joint", "poses", "detail", "texture"]),
-    (False, {}, ["given", *START, "joint", "poses", "detail", "texture"]),
-    (True, {"watertight": True}, ["given", *START, "joint", "poses", "detail", "texture"]),
-])
+@pytest.mark.parametrize(
+    ("opened", "settings", "expected"),
+    [
+        (True, {}, ["given", "exposures", "joint", "poses", "detail", "texture"]),
+        (True, {"exposures": "keep"}, ["given", "joint", "poses", "detail", "texture"]),
+        (False, {}, ["given", *START, "joint", "poses", "detail", "texture"]),
+        (True, {"watertight": True}, ["given", *START, "joint", "poses", "detail", "texture"]),
+    ],
+)
 def test_stages_from_given_fields(tmp_path, opened, settings, expected):
     ball = sphere(TetLattice(12))
     msdf = ball.msdf - 2 * np.float32(opened)

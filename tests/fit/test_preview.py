@@ -36,8 +36,16 @@ def test_preview_is_less_work_in_every_respect(given):
     assert rough.config == FitConfig.for_effort("preview") and not rough.report
     assert rough.config.resolution < 64
     before, after = usual.config.settings(), rough.config.settings()
-    for name in ("radiance.batch", "cavities.iterations", "refinement.iterations", "iterations",
-                 "render.primal_spp", "render.max_depth", "model.light_height", "triptychs"):
+    for name in (
+        "radiance.batch",
+        "cavities.iterations",
+        "refinement.iterations",
+        "iterations",
+        "render.primal_spp",
+        "render.max_depth",
+        "model.light_height",
+        "triptychs",
+    ):
         assert after[name] < before[name], name
     pixels = [settings["openings.iterations"] * settings["radiance.batch"] for settings in (after, before)]
     assert pixels[0] < pixels[1] / 2
@@ -60,8 +68,13 @@ def test_an_effort_that_there_is_not(capfd):
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_other_options_override_those_of_the_preview(given, order):
-    words = [["--effort", "preview"], ["--iterations", "70"], ["--resolution", "24"], ["--watertight"],
-             ["-o", "there"]]
+    words = [
+        ["--effort", "preview"],
+        ["--iterations", "70"],
+        ["--resolution", "24"],
+        ["--watertight"],
+        ["-o", "there"],
+    ]
     found = given(*(word for group in words[::order] for word in group))
     assert found.config == FitConfig.for_effort("preview", iterations=70, resolution=24, watertight=True)
     assert str(found.output) == "there" and str(found.scene) == "scene.xml"

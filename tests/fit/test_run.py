@@ -26,8 +26,13 @@ def start(scene: Path, output: Path, *arguments: str) -> subprocess.Popen:
     """The command in a process of its own, to be killed."""
     command = [sys.executable, "-m", "gshell_mi.fit", str(scene), "-o", str(output), *SHORT, *arguments]
     # A shell starts background jobs with Ctrl-C ignored, and tests may run in one.
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-                            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
 
 
 def wait_for_step(process: subprocess.Popen, output: Path, stage: str, iteration: int) -> None:
@@ -61,8 +66,16 @@ def whole(bowl_scene, tmp_path_factory) -> Path:
 
 
 def test_folder_is_complete(whole):
-    expected = {"scene.xml", "mesh.ply", "template.ply", "light.exr", "metrics.json", "log.jsonl",
-                "checkpoint.npz", "views"}
+    expected = {
+        "scene.xml",
+        "mesh.ply",
+        "template.ply",
+        "light.exr",
+        "metrics.json",
+        "log.jsonl",
+        "checkpoint.npz",
+        "views",
+    }
     assert expected <= {path.name for path in whole.iterdir()}
     assert not list(whole.glob(".*")), "no partial files"
     assert {path.stem for path in (whole / "views").iterdir()} == {f"view_{i:03}" for i in range(VIEWS)}
@@ -113,7 +126,7 @@ def test_exported_scene_renders_without_the_package(whole):
         import sys
         import mitsuba as mi, numpy as np
         mi.set_variant("llvm_ad_rgb")
-        scene = mi.load_file({str(whole / 'scene.xml')!r})
+        scene = mi.load_file({str(whole / "scene.xml")!r})
         image = np.array(mi.render(scene, spp=16))
         assert image.shape == ({SIZE}, {SIZE}, 4) and np.isfinite(image).all()
         assert 0.05 < image[..., 3].mean() < 0.6, "the object is seen, and the light behind it is not"
@@ -197,9 +210,13 @@ def test_killed_and_resumed(bowl_scene, tmp_path):
     options = "--openings.no-revise", "--texture.rounds", "1"
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert fit(bowl_scene, whole, *options) == 0
-    for stage, iteration, resume in (("openings", 30, ()), ("cavities", 5, ("--resume",)),
-                                     ("refinement", 3, ("--resume",)), ("joint", 1, ("--resume",)),
-                                     ("texture", 2, ("--resume",))):
+    for stage, iteration, resume in (
+        ("openings", 30, ()),
+        ("cavities", 5, ("--resume",)),
+        ("refinement", 3, ("--resume",)),
+        ("joint", 1, ("--resume",)),
+        ("texture", 2, ("--resume",)),
+    ):
         process = start(bowl_scene, killed, "--checkpoint-seconds", "0.05", *options, *resume)
         wait_for_step(process, killed, stage, iteration)
         process.kill()
@@ -214,8 +231,9 @@ def test_killed_and_resumed(bowl_scene, tmp_path):
     # before; to 2 % in the refinement; in the joint stage to 1e-4 at first, a few per cent at the end.
     expected, found = (np.array([step["loss"] for step in log(output)]) for output in (whole, killed))
     tolerance = {"openings": 1e-3, "cavities": 1e-3, "refinement": 0.06, "joint": 0.2, "texture": 0.2}
-    allowed = [1e-3 if stage == "joint" and iteration <= 2 else tolerance[stage]
-               for stage, iteration in steps(whole)]
+    allowed = [
+        1e-3 if stage == "joint" and iteration <= 2 else tolerance[stage] for stage, iteration in steps(whole)
+    ]
     np.testing.assert_array_less(np.abs(found / expected - 1), allowed)
 
 
@@ -249,7 +267,8 @@ def test_overwriting_keeps_the_earlier_fit_until_the_new_one_is_there(bowl_scene
     assert steps(output) == [(stage, i) for stage, count in counts.items() for i in range(count)]
     assert (output / "views" / "holiday.jpg").read_text() == "mine" and not list(output.glob(".*"))
     assert {path.relative_to(output) for path in output.rglob("*.*")} == {
-        path.relative_to(output) for path in before}
+        path.relative_to(output) for path in before
+    }
 
 
 def test_no_stage_sees_what_is_held_out(bowl_scene, tmp_path, capfd):
@@ -280,8 +299,21 @@ def test_no_stage_sees_what_is_held_out(bowl_scene, tmp_path, capfd):
 
 def test_a_volume_is_judged(bowl_scene, tmp_path):
     output = tmp_path / "out"
-    options = (*CLOSED, "--iterations", "2", "--volume.iterations", "30", "--volume.side", "32",
-               "--volume.batch", "4096", "--resolution", "20", "--checkpoint-seconds", "0")
+    options = (
+        *CLOSED,
+        "--iterations",
+        "2",
+        "--volume.iterations",
+        "30",
+        "--volume.side",
+        "32",
+        "--volume.batch",
+        "4096",
+        "--resolution",
+        "20",
+        "--checkpoint-seconds",
+        "0",
+    )
     assert fit(bowl_scene, output, *options) == 0
     metrics = json.loads((output / "metrics.json").read_text())
     (gain,), (noise,) = metrics["volume"]["gain"], metrics["volume"]["noise"]

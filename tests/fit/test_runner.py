@@ -134,12 +134,20 @@ def test_a_checkpoint_in_a_stage_that_there_is_not(tmp_path):
 
 def test_a_surface_is_what_its_arrays_say(tmp_path):
     count = START.lattice.vertex_count
-    moved = [Moved(name, np.ones((5, 3)), np.zeros((5, 3)), {"radiance/opacity/value": np.ones(3)})
-             for name in ("folds", "refinement")]
+    moved = [
+        Moved(name, np.ones((5, 3)), np.zeros((5, 3)), {"radiance/opacity/value": np.ones(3)})
+        for name in ("folds", "refinement")
+    ]
     seen = Seen(np.ones((count, 3)), np.ones(count, bool), np.float32(2))
-    whole = replace(START, hull=np.arange(count), seen=seen, moved=tuple(moved),
-                    model={"log_radiance": np.ones((2, 4, 3))}, settled=True,
-                    gains=np.full((3, 3), 1.1))
+    whole = replace(
+        START,
+        hull=np.arange(count),
+        seen=seen,
+        moved=tuple(moved),
+        model={"log_radiance": np.ones((2, 4, 3))},
+        settled=True,
+        gains=np.full((3, 3), 1.1),
+    )
     checkpoint = Checkpoint("joint", 0, {}, whole.to_arrays())
     checkpoint.save(tmp_path / "checkpoint.npz")
     found = Surface.from_arrays(Checkpoint.load(tmp_path / "checkpoint.npz").arrays)

@@ -9,12 +9,15 @@ from gshell_mi.fit.lattices import last_lattice
 from gshell_mi.lattice import CubeLattice, FlexiCubesLattice, TetLattice
 
 
-@pytest.mark.parametrize(("shape", "settings", "expected"), [
-    ({}, {}, FlexiCubesLattice(12)),
-    ({"grid": "tet"}, {}, TetLattice(12)),
-    ({"grid": "tet"}, {"grid": "cube"}, CubeLattice(12)),
-    ({}, {"resolution": 16}, FlexiCubesLattice(16)),
-])
+@pytest.mark.parametrize(
+    ("shape", "settings", "expected"),
+    [
+        ({}, {}, FlexiCubesLattice(12)),
+        ({"grid": "tet"}, {}, TetLattice(12)),
+        ({"grid": "tet"}, {"grid": "cube"}, CubeLattice(12)),
+        ({}, {"resolution": 16}, FlexiCubesLattice(16)),
+    ],
+)
 def test_what_the_scene_leaves_open_is_chosen(shape, settings, expected):
     subject = mi.load_dict({"type": "gshell", "resolution": 12, **shape})
     assert last_lattice(subject, FitConfig(**settings)) == expected

@@ -31,8 +31,10 @@ def volume(surface) -> int:
 
 
 def test_what_hides_the_object_does_not_carve_it(exact):
-    whole, told, untold = (volume(Hull(exact.config.hull).run(fit, None, Silent())) for fit in (
-        exact, hidden(exact, 0, 0, told=True), hidden(exact, 0, 0, told=False)))
+    whole, told, untold = (
+        volume(Hull(exact.config.hull).run(fit, None, Silent()))
+        for fit in (exact, hidden(exact, 0, 0, told=True), hidden(exact, 0, 0, told=False))
+    )
     assert whole <= told < 1.3 * whole and untold < 0.8 * whole
 
 
@@ -42,11 +44,17 @@ def test_losses_of_the_joint_stage_do_not_depend_on_it(exact):
         fit = hidden(exact, color, alpha, told=True)
         surface = Hull(fit.config.hull).run(exact, None, Silent())
         count = len(surface.fields.sdf)
-        surface = dataclasses.replace(surface, seen=Seen(
-            np.full((count, 3), 0.4, np.float32), np.ones(count, bool), np.float32(0.8)))
+        surface = dataclasses.replace(
+            surface, seen=Seen(np.full((count, 3), 0.4, np.float32), np.ones(count, bool), np.float32(0.8))
+        )
         fit.scene.subject.set_fields(surface.fields)
-        joint = JointStage(fit.scene, start_material(fit.scene, surface, surface.lattice, fit.config),
-                           start_light(fit.scene, surface, fit.config), fit.config, iterations=4)
+        joint = JointStage(
+            fit.scene,
+            start_material(fit.scene, surface, surface.lattice, fit.config),
+            start_light(fit.scene, surface, fit.config),
+            fit.config,
+            iterations=4,
+        )
         losses.append([joint.step(step) for step in range(3)])
     for first, second in zip(*losses, strict=True):
         assert first == pytest.approx(second, rel=1e-3)

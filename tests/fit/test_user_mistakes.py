@@ -103,8 +103,11 @@ def test_sensors_of_the_same_id(told, scene):
 
 
 def test_orthographic_sensor(told, scene):
-    change(scene, '<sensor type="perspective" id="view_000">\n        <float name="fov" value="32"/>',
-           '<sensor type="orthographic" id="view_000">')
+    change(
+        scene,
+        '<sensor type="perspective" id="view_000">\n        <float name="fov" value="32"/>',
+        '<sensor type="orthographic" id="view_000">',
+    )
     assert re.search("Sensor 'view_000' is an? .*[Oo]rthographic.*, but a fit needs perspective", told())
 
 
@@ -118,17 +121,32 @@ def test_light_of_another_kind(told, scene):
     assert "no environment emitter with the id 'light'" in told()
 
 
-@pytest.mark.parametrize("emitter", ['<emitter type="point" id="p"/>', """
-    <shape type="rectangle" id="window"> <emitter type="area" id="p"/> </shape>"""])
+@pytest.mark.parametrize(
+    "emitter",
+    [
+        '<emitter type="point" id="p"/>',
+        """
+    <shape type="rectangle" id="window"> <emitter type="area" id="p"/> </shape>""",
+    ],
+)
 def test_another_emitter(told, scene, emitter):
     change(scene, "</shape>", f"</shape> {emitter}")
     assert "has another emitter beside 'light' ('p'); a fit explains the images by one environment" in told()
 
 
-@pytest.mark.parametrize(("name", "reason"), [
-    ("../../escaped", "has a '/'"), ("cam/3", "has a '/'"), ("a\\b", "has a '\\'"), ("..", "is no name"),
-    ("x" * 245, "is longer than 200 bytes"), ("x" * 300, "is longer than 200 bytes"),
-    ("&#10;", "cannot be printed"), ("ü" * 101, "is longer than 200 bytes")])
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("../../escaped", "has a '/'"),
+        ("cam/3", "has a '/'"),
+        ("a\\b", "has a '\\'"),
+        ("..", "is no name"),
+        ("x" * 245, "is longer than 200 bytes"),
+        ("x" * 300, "is longer than 200 bytes"),
+        ("&#10;", "cannot be printed"),
+        ("ü" * 101, "is longer than 200 bytes"),
+    ],
+)
 def test_ids_that_are_no_names_of_files(told, scene, name, reason):
     change(scene, '"view_004"', f'"{name}"')
     assert reason in told()
@@ -150,8 +168,11 @@ def test_unknown_grid(told, scene):
 
 
 def test_object_outside_the_box(told, scene):
-    change(scene, "</shape>",
-           '<transform name="to_world"> <scale value="0.1"/> <translate y="0.8"/> </transform> </shape>')
+    change(
+        scene,
+        "</shape>",
+        '<transform name="to_world"> <scale value="0.1"/> <translate y="0.8"/> </transform> </shape>',
+    )
     assert "no common volume in the box" in told(whole=True)
     assert "no common volume in the box" in told(whole=True), "and a second try is not told of an earlier fit"
 
@@ -213,11 +234,21 @@ def test_unknown_variant(told):
     assert "variant 'scalar_rgb' is not usable" in told("--variant", "scalar_rgb")
 
 
-@pytest.mark.parametrize(("option", "value"), [
-    ("--render.spp", "0"), ("--radiance.batch", "0"), ("--iterations", "-1"), ("--render.max-depth", "1"),
-    ("--joint.warmup", "1.5"), ("--gains.prior", "0"), ("--gains.places", "0"),
-    ("--resolution", "0"), ("--checkpoint-seconds", "-1"), ("--losses.light-grey", "-0.1"),
-])
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--render.spp", "0"),
+        ("--radiance.batch", "0"),
+        ("--iterations", "-1"),
+        ("--render.max-depth", "1"),
+        ("--joint.warmup", "1.5"),
+        ("--gains.prior", "0"),
+        ("--gains.places", "0"),
+        ("--resolution", "0"),
+        ("--checkpoint-seconds", "-1"),
+        ("--losses.light-grey", "-0.1"),
+    ],
+)
 def test_setting_out_of_range(told, option, value):
     assert option.strip("-").replace("-", " ").split()[-1] in told(option, value)
 
@@ -230,8 +261,11 @@ def test_no_material_to_keep(told, scene, mode):
 
 def test_every_number_has_its_bounds():
     """NaN, infinity and negative numbers make no sense anywhere; 0 switches off or is refused."""
-    numbers = {name: value for name, value in FitConfig(resolution=64).settings().items()
-               if isinstance(value, int | float) and not isinstance(value, bool)}
+    numbers = {
+        name: value
+        for name, value in FitConfig(resolution=64).settings().items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
     assert len(numbers) > 50
     for name, value in numbers.items():
         impossible = [-1] if isinstance(value, int) else [-0.1, np.nan, np.inf]
@@ -278,20 +312,49 @@ def test_the_new_names_are_settings():
 
 
 def test_smoothing_and_rates_of_0_switch_off(bowl_scene, tmp_path):
-    off = [word for name in ("radiance.smoothing", "refinement.smoothing", "refinement.lr",
-                             "refinement.radiance-lr", "joint.geometry-smoothing", "joint.geometry-detail",
-                             "joint.geometry-lr", "joint.deform-lr", "joint.material-smoothing",
-                             "joint.material-lr", "joint.light-lr", "checkpoint-seconds",
-                             "hull.daylight-votes", "topology.min-area", "joint.warmup", "joint.color-hold")
-           for word in (f"--{name}", "0")]
+    off = [
+        word
+        for name in (
+            "radiance.smoothing",
+            "refinement.smoothing",
+            "refinement.lr",
+            "refinement.radiance-lr",
+            "joint.geometry-smoothing",
+            "joint.geometry-detail",
+            "joint.geometry-lr",
+            "joint.deform-lr",
+            "joint.material-smoothing",
+            "joint.material-lr",
+            "joint.light-lr",
+            "checkpoint-seconds",
+            "hull.daylight-votes",
+            "topology.min-area",
+            "joint.warmup",
+            "joint.color-hold",
+        )
+        for word in (f"--{name}", "0")
+    ]
     assert main([str(bowl_scene), "-o", str(tmp_path), *SHORT, *CLOSED, "--iterations", "3", *off]) == 0
     losses = [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert np.isfinite(losses).all()
 
 
 def test_no_surface_left(told, scene, tmp_path):
-    sentence = told(*CLOSED, "--refinement.iterations", "0", "--joint.warmup", "0", "--losses.extra",
-                    "hole_opening", "1e6", "--joint.geometry-lr", "2", "--joint.msdf-lr", "9", whole=True)
+    sentence = told(
+        *CLOSED,
+        "--refinement.iterations",
+        "0",
+        "--joint.warmup",
+        "0",
+        "--losses.extra",
+        "hole_opening",
+        "1e6",
+        "--joint.geometry-lr",
+        "2",
+        "--joint.msdf-lr",
+        "9",
+        whole=True,
+    )
     assert "has left no surface; start again with --overwrite and a smaller --joint.geometry-lr" in sentence
     output = tmp_path / "out"
     assert Checkpoint.load(output / "checkpoint.npz").stage == "joint", "nothing is lost"
@@ -300,8 +363,11 @@ def test_no_surface_left(told, scene, tmp_path):
 
 def test_given_fields_without_a_surface(told, scene):
     np.savez(scene.parent / "air.npz", sdf=np.ones(21**3, np.float32))
-    change(scene, '<integer name="resolution" value="20"/>',
-           f'<string name="filename" value="{scene.parent / "air.npz"}"/>')
+    change(
+        scene,
+        '<integer name="resolution" value="20"/>',
+        f'<string name="filename" value="{scene.parent / "air.npz"}"/>',
+    )
     assert "air.npz' of the gshell shape" in told() and "hold no surface" in told()
 
 
@@ -379,9 +445,12 @@ def test_a_light_that_the_scene_reads_stays(told, scene, tmp_path):
     output.mkdir()
     OwnFolder(output, "fit").claim("light.exr")
     mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(output / "light.exr"))
-    change(scene, '<emitter type="constant" id="light"/>',
-           f'<default name="map" value="{output}/light.exr"/> <emitter type="envmap" id="light"> '
-           '<string name="filename" value="$map"/> </emitter>')
+    change(
+        scene,
+        '<emitter type="constant" id="light"/>',
+        f'<default name="map" value="{output}/light.exr"/> <emitter type="envmap" id="light"> '
+        '<string name="filename" value="$map"/> </emitter>',
+    )
     assert f"'{output / 'light.exr'}' is read by this run and would be replaced by it" in told("--overwrite")
 
 
@@ -418,30 +487,47 @@ def test_all_views_held_out(told):
 
 
 def test_resume_with_other_views_held_out(told, stopped):
-    assert "was made with hold_out = 0, not 4; resume with the same settings" in told("--resume",
-                                                                                      "--hold-out", "4")
+    assert "was made with hold_out = 0, not 4; resume with the same settings" in told(
+        "--resume", "--hold-out", "4"
+    )
 
 
 def test_resume_with_other_settings(told, stopped):
     assert "was made with render.max_depth = 2, not 3" in told("--resume", "--render.max-depth", "3")
 
 
-@pytest.mark.parametrize(("old", "new", "words"), [
-    ('value="20"', 'value="24"', "(lattice: flexicubes, 20 cells instead of flexicubes, 24 cells)"),
-    ('<integer name="resolution" value="20"/>',
-     '<integer name="resolution" value="20"/> <string name="grid" value="tet"/>',
-     "(lattice: flexicubes, 20 cells instead of tet, 20 cells)"),
-    ("</shape>", '<transform name="to_world"> <scale value="2"/> </transform> </shape>',
-     "(to_world of the gshell shape)"),
-    ("</shape>", '<bsdf type="diffuse"> <rgb name="reflectance" value="0.1"/> </bsdf> </shape>',
-     "(material of the gshell shape)"),
-    ("</shape>", '</shape> <shape type="sphere"> <point name="center" x="9" y="0" z="0"/> </shape>',
-     "(objects beside the gshell shape)"),
-    ('<emitter type="constant" id="light"/>',
-     '<emitter type="constant" id="light"> <rgb name="radiance" value="2"/> </emitter>',
-     "(initial light)"),
-    ('"32"', '"33"', "(cameras of 'view_000')"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('value="20"', 'value="24"', "(lattice: flexicubes, 20 cells instead of flexicubes, 24 cells)"),
+        (
+            '<integer name="resolution" value="20"/>',
+            '<integer name="resolution" value="20"/> <string name="grid" value="tet"/>',
+            "(lattice: flexicubes, 20 cells instead of tet, 20 cells)",
+        ),
+        (
+            "</shape>",
+            '<transform name="to_world"> <scale value="2"/> </transform> </shape>',
+            "(to_world of the gshell shape)",
+        ),
+        (
+            "</shape>",
+            '<bsdf type="diffuse"> <rgb name="reflectance" value="0.1"/> </bsdf> </shape>',
+            "(material of the gshell shape)",
+        ),
+        (
+            "</shape>",
+            '</shape> <shape type="sphere"> <point name="center" x="9" y="0" z="0"/> </shape>',
+            "(objects beside the gshell shape)",
+        ),
+        (
+            '<emitter type="constant" id="light"/>',
+            '<emitter type="constant" id="light"> <rgb name="radiance" value="2"/> </emitter>',
+            "(initial light)",
+        ),
+        ('"32"', '"33"', "(cameras of 'view_000')"),
+    ],
+)
 def test_resume_with_another_scene(told, scene, stopped, old, new, words):
     change(scene, old, new)
     assert words in told("--resume")
@@ -470,9 +556,20 @@ def test_resume_with_a_copy_elsewhere(scene, stopped, tmp_path):
         assert main([str(copy), "-o", str(stopped), *SHORT, *options]) == 130
 
 
-@pytest.mark.parametrize("damage", [
-    b"garbage\n", b"\n", b"\0\0\0\n", b"5\n", b'{"stage": "tea"}\n', b"\xff\xfe\n", b"{}",
-    b'{"stage": "openings", "iteration": "1"}\n', b"[" * 9000 + b"\n"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        b"garbage\n",
+        b"\n",
+        b"\0\0\0\n",
+        b"5\n",
+        b'{"stage": "tea"}\n',
+        b"\xff\xfe\n",
+        b"{}",
+        b'{"stage": "openings", "iteration": "1"}\n',
+        b"[" * 9000 + b"\n",
+    ],
+)
 def test_a_damaged_log_is_no_reason_to_stop(scene, stopped, damage):
     (stopped / "log.jsonl").write_bytes(damage)
     assert main([str(scene), "-o", str(stopped), *SHORT, "--openings.iterations", "1", "--resume"]) == 2

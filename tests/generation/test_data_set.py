@@ -118,17 +118,20 @@ def test_another_set_in_the_folder_is_left_alone(meshes, made):
     assert len(DataSet.open(made).records) == 8
 
 
-@pytest.mark.parametrize(("arguments", "sentence"), [
-    ([], "Nothing says where the data set goes"),
-    (["-o", "{tmp}/set"], "There is nothing to make a data set of"),
-    (["{tmp}/no", "-o", "{tmp}/set"], "does not exist; check the path"),
-    (["{tmp}", "-o", "{tmp}/set"], "holds no mesh"),
-    (["-o", "{tmp}/set", "--garments", "3", "--side", "20"], "--side must be a multiple of 8"),
-    (["-o", "{tmp}/set", "--garments", "3", "--held-out", "1"], "--held-out must be at least 0"),
-    (["-o", "{tmp}/set", "--garments", "3", "--processes", "0"], "--processes must be at least 1"),
-    (["-o", "{tmp}/set", "--garments", "1000000000000"], "--garments must be at most"),
-    (["-o", "{tmp}/set", "--garments", "3", "--max-chamfer", "nan"], "--max-chamfer must be more than 0"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "Nothing says where the data set goes"),
+        (["-o", "{tmp}/set"], "There is nothing to make a data set of"),
+        (["{tmp}/no", "-o", "{tmp}/set"], "does not exist; check the path"),
+        (["{tmp}", "-o", "{tmp}/set"], "holds no mesh"),
+        (["-o", "{tmp}/set", "--garments", "3", "--side", "20"], "--side must be a multiple of 8"),
+        (["-o", "{tmp}/set", "--garments", "3", "--held-out", "1"], "--held-out must be at least 0"),
+        (["-o", "{tmp}/set", "--garments", "3", "--processes", "0"], "--processes must be at least 1"),
+        (["-o", "{tmp}/set", "--garments", "1000000000000"], "--garments must be at most"),
+        (["-o", "{tmp}/set", "--garments", "3", "--max-chamfer", "nan"], "--max-chamfer must be more than 0"),
+    ],
+)
 def test_mistakes_are_told(arguments, sentence, tmp_path, capsys, variant):
     given = [argument.replace("{tmp}", str(tmp_path)) for argument in arguments]
     assert main([*given, "--variant", variant]) == 2

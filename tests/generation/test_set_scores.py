@@ -19,8 +19,9 @@ def shapes(count: int, seed: int, offset: float = 0.0) -> np.ndarray:
 
 
 def accuracy(a: np.ndarray, b: np.ndarray) -> float:
-    return nearest_neighbour_accuracy(chamfer_distances(a, a), chamfer_distances(a, b),
-                                      chamfer_distances(b, b))
+    return nearest_neighbour_accuracy(
+        chamfer_distances(a, a), chamfer_distances(a, b), chamfer_distances(b, b)
+    )
 
 
 def test_copies_of_the_set_are_as_good_as_it_gets():

@@ -39,8 +39,10 @@ def same_weights(a, b) -> bool:
     return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
 
 
-@pytest.mark.parametrize(("model", "stages"), [
-    ("shape", {"flow": 300}), ("latent", {"autoencoder": 48, "flow": 32}), ("unet", {"unet": 80})])
+@pytest.mark.parametrize(
+    ("model", "stages"),
+    [("shape", {"flow": 300}), ("latent", {"autoencoder": 48, "flow": 32}), ("unet", {"unet": 80})],
+)
 def test_the_loss_falls(model, stages, tiny_set, tmp_path):
     train_tiny(tiny_set, tmp_path / "m", sum(stages.values()), model=model, rate=3e-3)
     for stage, steps in stages.items():
@@ -52,17 +54,22 @@ def test_the_loss_falls(model, stages, tiny_set, tmp_path):
 def test_a_seed_is_one_model_and_a_run_in_two_parts_the_same(tiny_set, tmp_path):
     train_tiny(tiny_set, tmp_path / "whole", 6)
     # The rate depends on the length of the whole, so the first part is that of a run cut off.
-    script = ("import sys, pathlib\n"
-              "from gshell_mi.generation import training\n"
-              "step = training._Training._take_step\n"
-              "def cut(self, *given):\n"
-              "    if self._all.step == 3: raise KeyboardInterrupt\n"
-              "    return step(self, *given)\n"
-              "training._Training._take_step = cut\n"
-              "from trained import train_tiny\n"
-              "train_tiny(pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), 6)\n")
-    ended = subprocess.run([sys.executable, "-c", script, tiny_set, tmp_path / "parts"],
-                           cwd=Path(__file__).parents[1], capture_output=True)
+    script = (
+        "import sys, pathlib\n"
+        "from gshell_mi.generation import training\n"
+        "step = training._Training._take_step\n"
+        "def cut(self, *given):\n"
+        "    if self._all.step == 3: raise KeyboardInterrupt\n"
+        "    return step(self, *given)\n"
+        "training._Training._take_step = cut\n"
+        "from trained import train_tiny\n"
+        "train_tiny(pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), 6)\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", script, tiny_set, tmp_path / "parts"],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+    )
     assert ended.returncode != 0 and len(losses(tmp_path / "parts")) == 3
     train_tiny(tiny_set, tmp_path / "parts", 6)
     assert losses(tmp_path / "parts") == losses(tmp_path / "whole")
@@ -201,15 +208,18 @@ def test_what_is_known_is_held(model, tiny_set):
     assert np.abs(found - whole)[0][~known & (np.abs(whole[0]) < 0.5)].mean() > 0.1
 
 
-@pytest.mark.parametrize(("arguments", "sentence"), [
-    (["{tmp}/no", "-o", "{tmp}/m"], "does not exist; check the path"),
-    (["{tmp}", "-o", "{tmp}/m"], "is no data set; make one with"),
-    (["{tmp}"], "Nothing says where the model goes"),
-    (["{tmp}", "-o", "{tmp}/m", "--model", "gan"], "--model 'gan' is not known; choose one of shape,"),
-    (["{tmp}", "-o", "{tmp}/m", "--size", "XXL"], "--size 'XXL' is not known"),
-    (["{tmp}", "-o", "{tmp}/m", "--minutes", "0"], "--minutes must be more than 0"),
-    (["{tmp}", "-o", "{tmp}/m", "--batch", "-1"], "--batch must be more than 0"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["{tmp}/no", "-o", "{tmp}/m"], "does not exist; check the path"),
+        (["{tmp}", "-o", "{tmp}/m"], "is no data set; make one with"),
+        (["{tmp}"], "Nothing says where the model goes"),
+        (["{tmp}", "-o", "{tmp}/m", "--model", "gan"], "--model 'gan' is not known; choose one of shape,"),
+        (["{tmp}", "-o", "{tmp}/m", "--size", "XXL"], "--size 'XXL' is not known"),
+        (["{tmp}", "-o", "{tmp}/m", "--minutes", "0"], "--minutes must be more than 0"),
+        (["{tmp}", "-o", "{tmp}/m", "--batch", "-1"], "--batch must be more than 0"),
+    ],
+)
 def test_mistakes_are_told(arguments, sentence, tmp_path, capsys):
     assert main([argument.replace("{tmp}", str(tmp_path)) for argument in arguments]) == 2
     assert sentence in capsys.readouterr().err
@@ -225,9 +235,25 @@ def test_a_missing_gpu_is_told(tiny_set, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_killed_training_goes_on(tiny_set, tmp_path):
-    command = [sys.executable, "-m", "gshell_mi.train", str(tiny_set), "-o", str(tmp_path / "m"),
-               "--size", "XS", "--steps", "100000", "--batch",
-               "2", "--pictures", "0", "--device", "cpu", "--quiet"]
+    command = [
+        sys.executable,
+        "-m",
+        "gshell_mi.train",
+        str(tiny_set),
+        "-o",
+        str(tmp_path / "m"),
+        "--size",
+        "XS",
+        "--steps",
+        "100000",
+        "--batch",
+        "2",
+        "--pictures",
+        "0",
+        "--device",
+        "cpu",
+        "--quiet",
+    ]
     process = subprocess.Popen(command)
     log = tmp_path / "m" / "log.jsonl"
     while not log.exists():

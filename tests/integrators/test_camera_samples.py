@@ -18,8 +18,9 @@ class Chosen:
 
     def __init__(self, hide_emitters=True, sampler="independent", radius=0.5):
         sensor = {**scenes.camera(SIZE), "sampler": {"type": sampler, "sample_count": SPP}}
-        self.scene = scenes.load(sensor, scenes.constant(),
-                                 scenes.make_mesh("subject", *scenes.sphere(3, radius)))
+        self.scene = scenes.load(
+            sensor, scenes.constant(), scenes.make_mesh("subject", *scenes.sphere(3, radius))
+        )
         parameters = mi.traverse(self.scene)
         dr.enable_grad(parameters["subject.vertex_positions"])
         parameters.update()
@@ -27,10 +28,12 @@ class Chosen:
         self.sensor = self.scene.sensors()[0]
         with dr.suspend_grad():
             _, self.before, _, self.samples = _prepare(self.integrator, self.scene, self.sensor, 7, SPP)
-            self.warp = Warp(self.scene, scene_edge_tables(self.scene), self.sensor, self.samples,
-                             self.integrator)
+            self.warp = Warp(
+                self.scene, scene_edge_tables(self.scene), self.sensor, self.samples, self.integrator
+            )
             self.index, self.traced, self.sampler = not_lost(
-                self.integrator, self.scene, self.sensor, self.samples, self.before, self.warp, 7)
+                self.integrator, self.scene, self.sensor, self.samples, self.before, self.warp, 7
+            )
 
     def hits(self, samples):
         ray, _ = samples.rays(self.sensor, samples.u)

@@ -64,9 +64,13 @@ def test_empty_mesh_beside_another_changes_nothing(kind):
     v, f = scenes.sphere(1, 0.7)
     empty = scenes.make_mesh("empty", np.zeros((3, 3)), np.zeros((1, 3), int))
     integrator = make_integrator(kind)
-    with_it, without = (gradient(scenes.load(scenes.camera(16), scenes.constant(),
-                                             scenes.make_mesh("subject", v, f), **others), integrator)
-                        for others in ({"other": empty}, {}))
+    with_it, without = (
+        gradient(
+            scenes.load(scenes.camera(16), scenes.constant(), scenes.make_mesh("subject", v, f), **others),
+            integrator,
+        )
+        for others in ({"other": empty}, {})
+    )
     np.testing.assert_allclose(with_it[0], without[0], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(with_it[1], without[1], atol=1e-3 * np.abs(without[1]).max())
 
@@ -83,19 +87,24 @@ def test_finite(name, kind):
 
 def test_a_sample_that_is_no_number_is_left_out():
     """A sliver's attributes may interpolate to NaN."""
+
     def image(color):
         v, f = scenes.sphere(2)
         colors = np.full((len(v), 3), 0.5, np.float32)
         colors[np.argmax(v[:, 2])] = color
-        mesh = scenes.make_mesh("subject", v, f, {"type": "diffuse", "reflectance": {
-            "type": "mesh_attribute", "name": "vertex_color"}})
+        mesh = scenes.make_mesh(
+            "subject",
+            v,
+            f,
+            {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}},
+        )
         mesh.add_attribute("vertex_color", 3, colors.ravel())
         scene = scenes.load(scenes.camera(16), scenes.constant(), mesh)
         return np.array(mi.render(scene, integrator=make_integrator(), spp=4))
 
     broken, whole = image(np.nan), image(0.5)
     assert np.isfinite(broken).all()
-    changed = np.abs(broken - whole).max(axis=-1) > 1e-5    # rounding differs from run to run on a GPU
+    changed = np.abs(broken - whole).max(axis=-1) > 1e-5  # rounding differs from run to run on a GPU
     assert changed[8, 8] and 0 < changed.mean() < 0.25
 
 
@@ -120,14 +129,17 @@ def compiled(run):
 def test_no_recompilation_when_sizes_change():
     """A mesh of another connectivity in every iteration, its buffers padded to the same sizes."""
     integrator = make_integrator()
-    scene = scenes.load(scenes.camera(24), scenes.constant(),
-                        scenes.make_mesh("subject", np.zeros((600, 3)), np.zeros((1200, 3), int)))
+    scene = scenes.load(
+        scenes.camera(24),
+        scenes.constant(),
+        scenes.make_mesh("subject", np.zeros((600, 3)), np.zeros((1200, 3), int)),
+    )
     params = mi.traverse(scene)
 
     def iterate(n, seed):
         v, f = scenes.sheet(n)
         vertices, faces = np.repeat(v[:1], 600, 0), np.zeros((1200, 3), int)
-        vertices[:len(v)], faces[:len(f)] = v, f
+        vertices[: len(v)], faces[: len(f)] = v, f
         params["subject.vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
         params["subject.faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
         dr.enable_grad(params["subject.vertex_positions"])
@@ -154,4 +166,4 @@ def test_memory_stays_flat():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for seed in range(450):
         gradient(scene, integrator, seed=seed)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 30_000    # KiB
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 30_000  # KiB

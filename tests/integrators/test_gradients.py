@@ -14,8 +14,16 @@ from pipelines.surface_differences import SurfaceImage
 
 RESOLUTION = 24
 CASES = {case.name: case for case in scenes.SCENES}
-QUICK = ["sphere_translating", "sheet_scaling", "sharp_pleats", "cube_flat_shaded", "many_flat_faces",
-         "leaving_the_frame", "shadow_point_light", "shadow_directional"]
+QUICK = [
+    "sphere_translating",
+    "sheet_scaling",
+    "sharp_pleats",
+    "cube_flat_shaded",
+    "many_flat_faces",
+    "leaving_the_frame",
+    "shadow_point_light",
+    "shadow_directional",
+]
 
 
 def path(case, **options):
@@ -54,15 +62,16 @@ def test_points_on_surfaces_make_the_same_image(name):
     assert image[..., :3].mean() == pytest.approx(expected[..., :3].mean(), rel=0.01)
 
 
-@pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow)
-                                  for name in CASES])
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+)
 def test_against_finite_differences(name):
     case = CASES[name]
     mover = scenes.Mover(case, RESOLUTION)
     fd, fd_error = converged(lambda seed: SurfaceImage(mover, case, 200_000, seed).difference(case.step), 6)
     mean, error = converged(lambda seed: scenes.forward_image(mover, path(case), 64, seed), 8)
     assert abs(mean - fd) <= max(0.01 * abs(fd), 3.5 * np.hypot(fd_error, error))
-    assert np.hypot(fd_error, error) < 0.05 * abs(fd)    # else the line above says nothing
+    assert np.hypot(fd_error, error) < 0.05 * abs(fd)  # else the line above says nothing
 
 
 @pytest.mark.parametrize("name", ["shirt_translating", "open_box", "border_sampled"])
@@ -90,16 +99,21 @@ def test_paths_that_are_not_differentiated_are_in_the_image_alone():
     mover, weights = scenes.Mover(case, RESOLUTION), scenes.image_weights(RESOLUTION)
     short, long, both = (
         mi.load_dict({"type": "gshell_path", "hide_emitters": True, **depths})
-        for depths in ({"max_depth": 3}, {"max_depth": 5}, {"max_depth": 5, "gradient_depth": 3}))
-    of_short, of_long, of_both = (np.array(mi.render(mover.scene, integrator=integrator, spp=8, seed=3))
-                                  for integrator in (short, long, both))
+        for depths in ({"max_depth": 3}, {"max_depth": 5}, {"max_depth": 5, "gradient_depth": 3})
+    )
+    of_short, of_long, of_both = (
+        np.array(mi.render(mover.scene, integrator=integrator, spp=8, seed=3))
+        for integrator in (short, long, both)
+    )
     # To rounding: a film adds its samples up in the order in which threads get there.
     np.testing.assert_allclose(of_both, of_long, rtol=1e-5, atol=1e-7)
     assert of_long[..., :3].sum() > 1.02 * of_short[..., :3].sum()
-    assert (weighted([scenes.forward_image(mover, both, 8, 3)])[0]
-            == pytest.approx(weighted([scenes.forward_image(mover, short, 8, 3)])[0], rel=1e-4))
-    assert (scenes.reverse_derivative(mover, both, 8, 3, weights)
-            == pytest.approx(scenes.reverse_derivative(mover, short, 8, 3, weights), rel=1e-4))
+    assert weighted([scenes.forward_image(mover, both, 8, 3)])[0] == pytest.approx(
+        weighted([scenes.forward_image(mover, short, 8, 3)])[0], rel=1e-4
+    )
+    assert scenes.reverse_derivative(mover, both, 8, 3, weights) == pytest.approx(
+        scenes.reverse_derivative(mover, short, 8, 3, weights), rel=1e-4
+    )
 
 
 def test_few_samples_are_unbiased():
@@ -121,12 +135,19 @@ def shadow_of_a_curtain(profile):
     i = 2 * np.arange(count - 1)
     f = np.concatenate([np.stack([i, i + 1, i + 2], -1), np.stack([i + 1, i + 3, i + 2], -1)])
     floor = scenes.plane(size=8)
-    case = scenes.GradientScene("curtain", "", lambda _: (
-        scenes.load(scenes.camera(RESOLUTION, (0.4, 0, 0.4), (0.02, 0, 0)),
-                    scenes.directional_light((0, 0, -1)),
-                    scenes.make_mesh("subject", v, f),
-                    floor=scenes.make_mesh("floor", floor[0][:, [0, 2, 1]], floor[1], smooth=False)),
-        scenes.translation(v, (1, 0, 0))))
+    case = scenes.GradientScene(
+        "curtain",
+        "",
+        lambda _: (
+            scenes.load(
+                scenes.camera(RESOLUTION, (0.4, 0, 0.4), (0.02, 0, 0)),
+                scenes.directional_light((0, 0, -1)),
+                scenes.make_mesh("subject", v, f),
+                floor=scenes.make_mesh("floor", floor[0][:, [0, 2, 1]], floor[1], smooth=False),
+            ),
+            scenes.translation(v, (1, 0, 0)),
+        ),
+    )
     mover = scenes.Mover(case, RESOLUTION)
     images = [scenes.forward_image(mover, path(case, light_edge_samples=16), 16, seed) for seed in range(8)]
     return np.mean([image[..., :3].sum() for image in images])
@@ -143,15 +164,25 @@ def test_edges_in_line_with_the_light_cast_one_shadow():
 @pytest.mark.parametrize("copies", [False, True])
 def test_repeated_faces_change_no_derivative(copies):
     """Whose creases and silhouettes are there twice."""
+
     def derivative(doubled):
         box = trimesh.creation.box((1.2, 1.2, 1.2))
         v, f = np.array(box.vertices), np.array(box.faces)
         if doubled:
             again, v = (f + len(v), np.concatenate([v, v])) if copies else (f[:, ::-1], v)
             f = np.concatenate([f, again])
-        case = scenes.GradientScene("cube", "", lambda _: (
-            scenes.load(scenes.camera(RESOLUTION, (2, 2.5, 4)), scenes.sky(),
-                        scenes.make_mesh("subject", v, f, smooth=False)), scenes.translation(v)))
+        case = scenes.GradientScene(
+            "cube",
+            "",
+            lambda _: (
+                scenes.load(
+                    scenes.camera(RESOLUTION, (2, 2.5, 4)),
+                    scenes.sky(),
+                    scenes.make_mesh("subject", v, f, smooth=False),
+                ),
+                scenes.translation(v),
+            ),
+        )
         mover = scenes.Mover(case, RESOLUTION)
         return weighted([scenes.forward_image(mover, path(case), 16, seed) for seed in range(4)]).mean()
 
@@ -163,11 +194,12 @@ def test_alpha_of_a_scaled_sphere():
     case = CASES["sphere_scaling"]
     mover = scenes.Mover(case, 32)
     image = np.mean([scenes.forward_image(mover, path(case), 64, s) for s in range(4)], 0)
-    tan2 = 1 / (5.0**2 - 1)     # square of the tangent of the cone around a unit sphere
-    derivative = 2 * 5**2 / (5**2 - 1) ** 2     # of that tangent's square, over the radius
+    tan2 = 1 / (5.0**2 - 1)  # square of the tangent of the cone around a unit sphere
+    derivative = 2 * 5**2 / (5**2 - 1) ** 2  # of that tangent's square, over the radius
     pixels = (16 / np.tan(np.deg2rad(20))) ** 2
-    assert np.pi * tan2 * pixels == pytest.approx(np.array(mi.render(
-        mover.scene, integrator=path(case), spp=64))[..., 3].sum(), rel=0.02)
+    assert np.pi * tan2 * pixels == pytest.approx(
+        np.array(mi.render(mover.scene, integrator=path(case), spp=64))[..., 3].sum(), rel=0.02
+    )
     assert image[..., 3].sum() == pytest.approx(np.pi * derivative * pixels, rel=0.02)
 
 
@@ -223,7 +255,7 @@ def opacity_derivative(hide_emitters, depth, **others):
     dr.set_grad(params[key], 1)
     integrator = mi.load_dict({"type": "gshell_path", "max_depth": depth, "hide_emitters": hide_emitters})
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)     # that shadows through it have no derivative
+        warnings.simplefilter("ignore", RuntimeWarning)  # that shadows through it have no derivative
         image = mi.render(scene, params, integrator=integrator, spp=256)
     return np.array(dr.forward_to(image)).sum((0, 1)), scene, params, key
 
@@ -240,15 +272,29 @@ def test_transparent_surfaces_look_as_in_stock_path():
     """Sheets of opacity one half before a lamp and a ball, with and without hidden emitters."""
     half = {"type": "mask", "opacity": {"type": "uniform", "value": 0.5}, "bsdf": scenes.diffuse()}
     v, f = scenes.sheet()
-    scene = scenes.load(scenes.camera(RESOLUTION), scenes.constant(), scenes.make_mesh("subject", v, f, half),
-                        second=scenes.make_mesh("second", v - np.array([0, 0, 0.5]), f, half),
-                        ball=scenes.make_mesh("ball", *scenes.sphere(2, 0.3, (0.5, 0, -1))),
-                        lamp={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]),
-                              "emitter": {"type": "area"}})
+    scene = scenes.load(
+        scenes.camera(RESOLUTION),
+        scenes.constant(),
+        scenes.make_mesh("subject", v, f, half),
+        second=scenes.make_mesh("second", v - np.array([0, 0, 0.5]), f, half),
+        ball=scenes.make_mesh("ball", *scenes.sphere(2, 0.3, (0.5, 0, -1))),
+        lamp={
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 0, -2]),
+            "emitter": {"type": "area"},
+        },
+    )
     for hide, depth in ((False, 1), (False, 4), (True, 1), (True, 2), (True, 4)):
-        path, ours = (np.array(mi.render(scene, integrator=mi.load_dict(
-            {"type": kind, "max_depth": depth, "hide_emitters": hide}), spp=512)).mean((0, 1))
-            for kind in ("path", "gshell_path"))
+        path, ours = (
+            np.array(
+                mi.render(
+                    scene,
+                    integrator=mi.load_dict({"type": kind, "max_depth": depth, "hide_emitters": hide}),
+                    spp=512,
+                )
+            ).mean((0, 1))
+            for kind in ("path", "gshell_path")
+        )
         assert ours[3] == pytest.approx(path[3], abs=2e-3)
         if not hide:
             np.testing.assert_allclose(ours[:3], path[:3], rtol=0.01)
@@ -263,11 +309,19 @@ def test_hidden_emitters_leave_a_transparent_sheet_its_light():
     images = []
     for opacity in (0.5, 1.0):
         sheet = {"type": "mask", "opacity": {"type": "uniform", "value": opacity}, "bsdf": scenes.diffuse()}
-        scene = scenes.load(scenes.camera(RESOLUTION), scenes.constant(),
-                            scenes.make_mesh("subject", *scenes.sheet(), sheet))
-        images += [np.array(mi.render(scene, integrator=mi.load_dict(
-            {"type": kind, "max_depth": 2, "hide_emitters": True}), spp=1024)).mean((0, 1))
-            for kind in ("gshell_path", "path")]
+        scene = scenes.load(
+            scenes.camera(RESOLUTION), scenes.constant(), scenes.make_mesh("subject", *scenes.sheet(), sheet)
+        )
+        images += [
+            np.array(
+                mi.render(
+                    scene,
+                    integrator=mi.load_dict({"type": kind, "max_depth": 2, "hide_emitters": True}),
+                    spp=1024,
+                )
+            ).mean((0, 1))
+            for kind in ("gshell_path", "path")
+        ]
     (half, _, full, stock_full) = images
     np.testing.assert_allclose(full, stock_full, rtol=0.01)
     np.testing.assert_allclose(half, full / 2, rtol=0.02)
@@ -338,18 +392,30 @@ def odd_shapes(folder):
     curve.write_text("".join(f"{x} {0.3 * x} 0.5 0.05\n" for x in (-1.5, -0.7, 0, 0.7, 1.5)))
     scenes.make_mesh("ball", *scenes.sphere(1, 0.3)).write_ply(str(folder / "ball.ply"))
     ball = {"type": "ply", "filename": str(folder / "ball.ply")}
-    instance = {"type": "instance", "id": "odd", "to_world": mi.ScalarTransform4f().translate([1, 0, 0]),
-                "shape": {"type": "ref", "id": "group"}}
+    instance = {
+        "type": "instance",
+        "id": "odd",
+        "to_world": mi.ScalarTransform4f().translate([1, 0, 0]),
+        "shape": {"type": "ref", "id": "group"},
+    }
     glass = {"type": "sphere", "id": "odd", "radius": 0.3, "bsdf": {"type": "dielectric"}}
     v, f = scenes.sheet(2)
     return {
         "curve": ({"odd": {"type": "bsplinecurve", "id": "odd", "filename": str(curve)}}, ["BSplineCurve"]),
-        "instance": ({"group": {"type": "shapegroup", "id": "group", "ball": ball}, "odd": instance},
-                     ["Instance"]),
+        "instance": (
+            {"group": {"type": "shapegroup", "id": "group", "ball": ball}, "odd": instance},
+            ["Instance"],
+        ),
         "glass": ({"odd": glass}, ["Sphere", "mirror or glass"]),
         "mirror": ({"odd": scenes.make_mesh("odd", v, f, {"type": "conductor"})}, ["mirror or glass"]),
-        "mask": ({"odd": scenes.make_mesh("odd", v, f, {"type": "mask", "opacity": 0.5,
-                                                        "bsdf": scenes.diffuse()})}, ["partly transparent"]),
+        "mask": (
+            {
+                "odd": scenes.make_mesh(
+                    "odd", v, f, {"type": "mask", "opacity": 0.5, "bsdf": scenes.diffuse()}
+                )
+            },
+            ["partly transparent"],
+        ),
     }
 
 

@@ -77,7 +77,7 @@ def test_silhouette_of_a_sphere_closes():
 
 def test_creases_of_a_flat_cube():
     scene, _ = scenes._cube(8)
-    (mesh, table), = scene_edge_tables(scene)
+    ((mesh, table),) = scene_edge_tables(scene)
     assert dr.count(crease_mask(mesh, table, 10)) == 12
     assert dr.count(crease_mask(mesh, table, 95)) == 0
 
@@ -93,7 +93,7 @@ def test_length_of_a_projected_circle():
     v, f = scenes.sphere(4)
     mesh = scenes.make_mesh("subject", v, f, smooth=False)
     scene = scenes.load(scenes.camera(64), scenes.constant(), mesh)
-    tangent = 1 / np.sqrt(5**2 - 1)     # of half the angle under which the sphere is seen
+    tangent = 1 / np.sqrt(5**2 - 1)  # of half the angle under which the sphere is seen
     circumference = 2 * np.pi * tangent * 32 / np.tan(np.deg2rad(20))
     # The silhouette of a polyhedron is a zigzag near that circle.
     assert projected_length(scene, crease_angle=30) == pytest.approx(circumference, rel=0.1)
@@ -120,10 +120,15 @@ def test_flat_meshes_have_no_shading_rim():
 def test_hidden_silhouettes_are_culled():
     v, f = scenes.sphere(3, 0.5)
     w, g = scenes.sheet(2, 3.0)
-    scene = scenes.load(scenes.camera(64), scenes.constant(), scenes.make_mesh("subject", v, f),
-                        curtain=scenes.make_mesh("curtain", w + np.array([0, 0, 1.5]), g))
-    alone = scenes.load(scenes.camera(64), scenes.constant(),
-                        scenes.make_mesh("curtain", w + np.array([0, 0, 1.5]), g))
+    scene = scenes.load(
+        scenes.camera(64),
+        scenes.constant(),
+        scenes.make_mesh("subject", v, f),
+        curtain=scenes.make_mesh("curtain", w + np.array([0, 0, 1.5]), g),
+    )
+    alone = scenes.load(
+        scenes.camera(64), scenes.constant(), scenes.make_mesh("curtain", w + np.array([0, 0, 1.5]), g)
+    )
     assert projected_length(scene) == pytest.approx(projected_length(alone), rel=1e-5)
     assert projected_length(scene, cull=False) > projected_length(alone) + 20
 

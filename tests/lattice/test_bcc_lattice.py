@@ -46,7 +46,7 @@ def test_corners(resolution):
         wanted = [place.get(tuple(np.array(p) + vector), MISSING) for p in place]
         np.testing.assert_array_equal(found, wanted)
         for vertex in np.flatnonzero(found != MISSING):
-            offset = lattice.corner_offset(corner, bool(vertex >= (resolution + 1)**3))
+            offset = lattice.corner_offset(corner, bool(vertex >= (resolution + 1) ** 3))
             assert vertex + offset == found[vertex]
 
 

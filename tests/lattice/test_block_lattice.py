@@ -40,8 +40,11 @@ def _ball(points, radius=0.3, x=0.0, y=0.0):
 def _fields(lattice, x):
     """A ball that moves, grows and is cut, with random offsets; ``weights`` as for all cells of n^3."""
     p, rng = lattice.points(mi.Float), np.random.default_rng(0)
-    fields = {"sdf": _ball(p, 0.25 + 0.1 * x, x), "msdf": 0.1 - p.z,
-              "deform": mi.Float(rng.uniform(-1, 1, 3 * lattice.vertex_count).astype(np.float32))}
+    fields = {
+        "sdf": _ball(p, 0.25 + 0.1 * x, x),
+        "msdf": 0.1 - p.z,
+        "deform": mi.Float(rng.uniform(-1, 1, 3 * lattice.vertex_count).astype(np.float32)),
+    }
     if lattice.weight_count:
         fields["weights"] = mi.Float(rng.normal(size=lattice.weight_count).astype(np.float32))
     return fields
@@ -114,8 +117,9 @@ def test_surface_never_runs_out_of_the_blocks(lattice):
     for seed, x in enumerate((0.0, 0.8)):  # inside; cut off by the border
         rng = np.random.default_rng(seed)
         blocks = BlockLattice.around(lattice, _ball(p, 0.2, x))
-        sdf, msdf, deform = (mi.Float(rng.uniform(-1, 1, n * blocks.vertex_count).astype(np.float32))
-                             for n in (1, 1, 3))
+        sdf, msdf, deform = (
+            mi.Float(rng.uniform(-1, 1, n * blocks.vertex_count).astype(np.float32)) for n in (1, 1, 3)
+        )
         mesh = extract(blocks, sdf, msdf, deform, template=True)
         assert mesh.face_count > 5000
         assert_manifold(*mesh.to_numpy()[:2])
@@ -131,6 +135,7 @@ def test_blocks_around_random_values_can_be_followed():
     lattice = TetLattice(70)
     blocks = BlockLattice.around(lattice, _ball(lattice.points(mi.Float), 0.2))
     for seed in range(4):
+
         def values(on, seed=seed):
             return mi.Float(np.random.default_rng(seed).normal(size=on.vertex_count).astype(np.float32))
 
@@ -187,8 +192,9 @@ def test_stored_vertices_are_those_of_the_lattice(lattice):
             expected = ids + step * lattice.stride**axis
             exists = (there >= 0) & (there < lattice.stride) & np.isin(expected, list(stored))
             assert (found[~exists] == 0xFFFFFFFF).all()
-            np.testing.assert_array_equal(blocks.lattice_vertex(mi.UInt32(found[exists])).numpy(),
-                                          expected[exists])
+            np.testing.assert_array_equal(
+                blocks.lattice_vertex(mi.UInt32(found[exists])).numpy(), expected[exists]
+            )
 
 
 def test_no_surface():
@@ -203,8 +209,11 @@ def test_non_finite_values(name):
     lattice = TetLattice(40)
     p = lattice.points(mi.Float)
     blocks = BlockLattice.around(lattice, _ball(p))
-    fields = {"sdf": blocks.take(_ball(p)), "msdf": blocks.take(p.z),
-              "deform": dr.zeros(mi.Float, 3 * blocks.vertex_count)}
+    fields = {
+        "sdf": blocks.take(_ball(p)),
+        "msdf": blocks.take(p.z),
+        "deform": dr.zeros(mi.Float, 3 * blocks.vertex_count),
+    }
     values = fields[name].numpy()
     values[len(values) // 2] = np.nan
     fields[name] = mi.Float(values)
@@ -232,7 +241,8 @@ def test_what_is_not_stored_is_as_what_is_next_to_it(lattice):
     exists = blocks.in_lattice(dr.arange(mi.UInt32, blocks.vertex_count)).numpy()
     vertex = blocks.lattice_vertex(dr.arange(mi.UInt32, blocks.vertex_count)).numpy()[exists]
     np.testing.assert_array_equal(whole[vertex], everywhere[vertex])
-    _assert_equal_numbers(blocks.take(mi.Float(whole.ravel())).numpy().reshape(-1, 3)[exists],
-                          points.numpy().T[exists])
+    _assert_equal_numbers(
+        blocks.take(mi.Float(whole.ravel())).numpy().reshape(-1, 3)[exists], points.numpy().T[exists]
+    )
     nearest, _ = cKDTree(everywhere[vertex]).query(everywhere)
     np.testing.assert_allclose(np.linalg.norm(whole - everywhere, axis=1), nearest, atol=1e-5)

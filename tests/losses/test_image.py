@@ -53,9 +53,10 @@ def test_chroma_of_chosen_entries():
 A, B = mi.TensorXf([1.0, 0.0, 3.0], (3,)), mi.TensorXf([3.0, 0.0, 3.0], (3,))
 
 
-@pytest.mark.parametrize(("name", "expected"), [
-    ("l1", 2 / 3), ("smape", 2 / 4.01 / 3), ("relative_l2", 4 / 9.01 / 3), ("log_l1", np.log(2) / 3),
-])
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("l1", 2 / 3), ("smape", 2 / 4.01 / 3), ("relative_l2", 4 / 9.01 / 3), ("log_l1", np.log(2) / 3)],
+)
 def test_image_losses_by_name(name, expected):
     assert value(losses.IMAGE_LOSSES[name](A, B)) == pytest.approx(expected, rel=1e-5)
     assert value(losses.IMAGE_LOSSES[name](B, B)) == 0

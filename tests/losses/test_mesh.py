@@ -34,6 +34,7 @@ def test_normal_variation():
 
 def test_normal_variation_falls_with_the_square_of_the_edges():
     """Between neighbours on a sphere normals differ by edge length / radius."""
+
     def of_sphere(subdivisions):
         ball = trimesh.creation.icosphere(subdivisions=subdivisions)
         normals = mi.Vector3f(np.ascontiguousarray(ball.vertices.T, np.float32))

@@ -44,5 +44,6 @@ def test_visible_terms():
     assert value(losses.visible_outside(mi.Float(msdf), alpha)) == pytest.approx(0.4 / 5)
     assert value(losses.visible_inside(mi.Float(msdf), alpha, covered)) == pytest.approx((0.4 + 0.2) / 5)
     np.testing.assert_allclose(gradient(lambda m: losses.visible_outside(m, alpha), msdf), [0.2, 0, 0, 0, 0])
-    np.testing.assert_allclose(gradient(lambda m: losses.visible_inside(m, alpha, covered), msdf),
-                               [0, 0, -0.2, 0, -0.1], atol=1e-7)
+    np.testing.assert_allclose(
+        gradient(lambda m: losses.visible_inside(m, alpha, covered), msdf), [0, 0, -0.2, 0, -0.1], atol=1e-7
+    )

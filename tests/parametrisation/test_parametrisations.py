@@ -27,8 +27,11 @@ def small_batches(monkeypatch):
 def bowl(lattice) -> dict[str, mi.Float]:
     """A sphere that is cut open at z = 0.2."""
     p = lattice.points(mi.Float)
-    start = {"sdf": dr.norm(p) - RADIUS, "msdf": 0.2 - p.z,
-             "deform": dr.zeros(mi.Float, 3 * lattice.vertex_count)}
+    start = {
+        "sdf": dr.norm(p) - RADIUS,
+        "msdf": 0.2 - p.z,
+        "deform": dr.zeros(mi.Float, 3 * lattice.vertex_count),
+    }
     if lattice.weight_count:
         start["weights"] = dr.zeros(mi.Float, lattice.weight_count)
     return start
@@ -63,8 +66,9 @@ def test_an_unknown_name():
         make_parametrisation("wavelet", bowl(lattice), lattice)
 
 
-@pytest.mark.parametrize("lattice", [TetLattice(10), CubeLattice(9), FlexiCubesLattice(8)],
-                         ids=lambda lattice: lattice.grid)
+@pytest.mark.parametrize(
+    "lattice", [TetLattice(10), CubeLattice(9), FlexiCubesLattice(8)], ids=lambda lattice: lattice.grid
+)
 @pytest.mark.parametrize("name", ["explicit", "multiresolution"])
 def test_grids_start_exactly(name, lattice):
     start = bowl(lattice)
@@ -150,8 +154,11 @@ def test_offsets_stay_in_their_range():
     lattice = TetLattice(6)
     for name in ("explicit", "multiresolution"):
         made = make_parametrisation(name, bowl(lattice), lattice, StepRules(deform_rate=3.0))
-        pull = {"sdf": dr.zeros(mi.Float, 343), "msdf": dr.zeros(mi.Float, 343),
-                "deform": dr.full(mi.Float, -1, 3 * 343)}
+        pull = {
+            "sdf": dr.zeros(mi.Float, 343),
+            "msdf": dr.zeros(mi.Float, 343),
+            "deform": dr.full(mi.Float, -1, 3 * 343),
+        }
         made.step(pull, 0.0)
         deform = made.fields()["deform"].numpy()
         assert deform.max() == 1 and deform.min() >= -1
@@ -196,8 +203,9 @@ def test_steps_fall_tenfold_and_those_of_a_rim_a_hundredfold():
     pull[300] = 1
     first = {}
     for progress, fallen in ((0.0, {"sdf": 1, "msdf": 1}), (1.0, {"sdf": 0.1, "msdf": 0.01})):
-        made = make_parametrisation("explicit", bowl(lattice), lattice,
-                                    StepRules(0.1, 0.2, 0.02, smoothing=0.0, detail=0.0))
+        made = make_parametrisation(
+            "explicit", bowl(lattice), lattice, StepRules(0.1, 0.2, 0.02, smoothing=0.0, detail=0.0)
+        )
         before = made.fields()
         made.step({name: mi.Float(pull) for name in names}, progress)
         moved = {name: abs(made.fields()[name][300] - before[name][300]) for name in names}

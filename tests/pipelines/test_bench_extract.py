@@ -18,8 +18,12 @@ def test_prints_the_ratio_of_every_contestant():
     counts = re.findall(r"^  (\w+): (\d+) triangles cut, \d+ vertices$", output, re.MULTILINE)
     assert [grid for grid, _ in counts] == 2 * list(GRIDS) and all(int(n) > 0 for _, n in counts)
     rows = re.findall(r"^  (\S.*?) +([\d.]+) ms +ratio +([\d.]+)$", output, re.MULTILINE)
-    ours = [f"{grid}: {fields}: {what}" for grid in GRIDS for fields in ("sdf, msdf", "sdf, msdf, deform")
-            for what in ("forward", "forward + backward")]
+    ours = [
+        f"{grid}: {fields}: {what}"
+        for grid in GRIDS
+        for fields in ("sdf, msdf", "sdf, msdf, deform")
+        for what in ("forward", "forward + backward")
+    ]
     assert sorted(name for name, *_ in rows) == sorted(2 * ["marching cubes", *ours])
     assert all(float(ratio) == 1 for name, _, ratio in rows if name == "marching cubes")
     exponents = re.findall(r"with the exponent -?[\d.]+ \((?:at most|above) 2\.2\)$", output, re.MULTILINE)

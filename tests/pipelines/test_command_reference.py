@@ -20,7 +20,14 @@ def test_page_is_current():
 
 def test_every_command_and_argument_is_there():
     text = load().reference()
-    for argument in ("SCENE", "-o, --output", "--no-report", "--openings.mask", "--envmap", "--remesh",
-                     "--up"):
+    for argument in (
+        "SCENE",
+        "-o, --output",
+        "--no-report",
+        "--openings.mask",
+        "--envmap",
+        "--remesh",
+        "--up",
+    ):
         assert f"| `{argument}` |" in text
     assert "| `--seed` | `0` | Seed of every random number of the fit. |" in text

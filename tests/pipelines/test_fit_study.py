@@ -31,8 +31,10 @@ from fit_study.trials import Outcome, Trial, is_done, load_outcome, run_trial, r
 
 #: The options of a fit that is over at once, whose openings do not matter, as NAME=VALUE.
 _OPTIONS = [*SHORT[:-1], *CLOSED[:-1], "--iterations", "2"]
-QUICK = ["openings.revise=false"] + [f"{flag[2:].replace('-', '_')}={value}"
-         for flag, value in dict(zip(_OPTIONS[::2], _OPTIONS[1::2], strict=True)).items()]
+QUICK = ["openings.revise=false"] + [
+    f"{flag[2:].replace('-', '_')}={value}"
+    for flag, value in dict(zip(_OPTIONS[::2], _OPTIONS[1::2], strict=True)).items()
+]
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +52,13 @@ def few_samples(monkeypatch):
 
 def outcome(config=None, **changes):
     counts = {name: {"found": 3, "reference": 2} for name in ("boundary_loops", "pinholes", "components")}
-    mesh = {**counts, "nonmanifold_edges": {"found": 0, "reference": 0}, "chamfer": 0.1234, "f_score": 0.9876,
-            "boundary_length": {"found": 1.0, "reference": 2.0}}
+    mesh = {
+        **counts,
+        "nonmanifold_edges": {"found": 0, "reference": 0},
+        "chamfer": 0.1234,
+        "f_score": 0.9876,
+        "boundary_length": {"found": 1.0, "reference": 2.0},
+    }
     scores = {"mesh": mesh, "mean": {"psnr": 31.239, "mask_iou": 0.98765}}
     return Outcome(config or {}, scores, 123.4, 70.0, **{"code": "a"} | changes)
 
@@ -68,12 +75,19 @@ def test_every_row_changes_what_it_says_and_is_accepted():
 def test_the_rows_switch_every_loss():
     default = FitConfig()
     stages = {stage: config for stage, config in vars(default).items() if dataclasses.is_dataclass(config)}
-    weights = {f"{stage}.{name}" for stage, config in stages.items()
-               for name, text in field_texts(type(config)).items()
-               if text.startswith(("Weight", "Final weight"))}
+    weights = {
+        f"{stage}.{name}"
+        for stage, config in stages.items()
+        for name, text in field_texts(type(config)).items()
+        if text.startswith(("Weight", "Final weight"))
+    }
     settings = default.settings()
-    switched = {name for row in ROWS for name, value in row.changes.items()
-                if name in weights and (value == 0) == (settings[name] > 0)}
+    switched = {
+        name
+        for row in ROWS
+        for name, value in row.changes.items()
+        if name in weights and (value == 0) == (settings[name] > 0)
+    }
     # Those two need another grid, and depth maps.
     assert switched == weights - {"losses.flexicubes_deviation", "losses.depth"}
     extra = {name for row in ROWS for name in row.changes.get("losses.extra", {})}
@@ -81,21 +95,27 @@ def test_the_rows_switch_every_loss():
 
 
 def test_settings_as_text():
-    config = parsed_settings(["resolution=48", "grid=bcc", "openings.mask=1", "losses.image=l1",
-                              "watertight=true"])
+    config = parsed_settings(
+        ["resolution=48", "grid=bcc", "openings.mask=1", "losses.image=l1", "watertight=true"]
+    )
     assert config == FitConfig(resolution=48, grid="bcc", watertight=True).changed(
-        {"openings.mask": 1.0, "losses.image": "l1"})
-    assert as_flags(non_default(config)) == ("--resolution 48 --grid bcc --watertight --openings.mask 1 "
-                                             "--losses.image l1")
+        {"openings.mask": 1.0, "losses.image": "l1"}
+    )
+    assert as_flags(non_default(config)) == (
+        "--resolution 48 --grid bcc --watertight --openings.mask 1 --losses.image l1"
+    )
 
 
-@pytest.mark.parametrize(("pair", "complaint"), [
-    ("resolution=fine", "'resolution' is a int, and 'fine' is none"),
-    ("watertight=1", "'watertight' is a bool"),
-    ("iterations", "'iterations' is a int"),
-    ("sharpness=3", "no setting 'sharpness'"),
-    ("iterations=-1", "--iterations must be at least 0"),
-])
+@pytest.mark.parametrize(
+    ("pair", "complaint"),
+    [
+        ("resolution=fine", "'resolution' is a int, and 'fine' is none"),
+        ("watertight=1", "'watertight' is a bool"),
+        ("iterations", "'iterations' is a int"),
+        ("sharpness=3", "no setting 'sharpness'"),
+        ("iterations=-1", "--iterations must be at least 0"),
+    ],
+)
 def test_settings_that_are_none(pair, complaint):
     with pytest.raises(UserError, match=complaint):
         parsed_settings([pair])
@@ -107,9 +127,19 @@ def test_table():
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert len({len(row) for row in cells}) == 1, "as many cells in every line"
     first = dict(zip(cells[0], cells[3], strict=True))
-    assert first == {"what": "first", "loops": "3 / 2", "pin-holes": "3", "components": "3 / 2",
-                     "non-manifold": "0", "rim": "0.50", "chamfer %": "0.123", "F-score": "0.988",
-                     "novel dB": "31.24", "mask IoU": "0.9877", "CPU s": "123"}
+    assert first == {
+        "what": "first",
+        "loops": "3 / 2",
+        "pin-holes": "3",
+        "components": "3 / 2",
+        "non-manifold": "0",
+        "rim": "0.50",
+        "chamfer %": "0.123",
+        "F-score": "0.988",
+        "novel dB": "31.24",
+        "mask IoU": "0.9877",
+        "CPU s": "123",
+    }
     assert [row[0] for row in cells[2:]] == ["**A**", "first", "**B**", "third"]
     assert cells[-1][1] == "failed: nothing"
     mixed = table([("A", "first", outcome()), ("A", "second", outcome(code="b"))], "what").splitlines()
@@ -131,8 +161,18 @@ def test_only_the_same_settings_count(tmp_path):
 
 
 def test_fits_scores_and_does_neither_twice(scene, tmp_path, capsys, monkeypatch):
-    options = [str(scene), "--rows", "default", "no-mask", "--set", *QUICK,
-               "-o", str(tmp_path / "fits"), "--page", str(tmp_path / "page.md")]
+    options = [
+        str(scene),
+        "--rows",
+        "default",
+        "no-mask",
+        "--set",
+        *QUICK,
+        "-o",
+        str(tmp_path / "fits"),
+        "--page",
+        str(tmp_path / "page.md"),
+    ]
     assert ablation.main(options) == 0
     told = capsys.readouterr().out.splitlines()
     assert told[0] == "2 fits, 0 of them exist already."

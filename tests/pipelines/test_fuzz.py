@@ -16,9 +16,24 @@ from fuzzing import targets
 from fuzzing.mutators import damage_file
 
 #: A few of each; some hundred inputs in ten seconds.
-QUICK = {"nerf": 12, "colmap_text": 12, "llff": 12, "images": 8, "scene": 6, "mesh_ply": 8, "mesh_obj": 8,
-         "scores": 12, "fields": 40, "block_fields": 20, "light": 12, "masks": 8, "known": 8, "video_mp4": 6,
-         "compare": 8, "export": 6}
+QUICK = {
+    "nerf": 12,
+    "colmap_text": 12,
+    "llff": 12,
+    "images": 8,
+    "scene": 6,
+    "mesh_ply": 8,
+    "mesh_obj": 8,
+    "scores": 12,
+    "fields": 40,
+    "block_fields": 20,
+    "light": 12,
+    "masks": 8,
+    "known": 8,
+    "video_mp4": 6,
+    "compare": 8,
+    "export": 6,
+}
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -55,11 +70,17 @@ def first_well(then):
     return lambda folder: None if folder.name == "good" else then(folder)
 
 
-@pytest.mark.parametrize("attempt, outcome", [
-    (lambda folder: None, "ok"), (refuse, "refused"), (lambda folder: 1 / 0, "failed ZeroDivisionError"),
-    (leave, "failed Broken: left behind after a refusal"), (stray, "failed Broken: written outside"),
-    (cut_short, "failed Broken: half-written"),
-])
+@pytest.mark.parametrize(
+    "attempt, outcome",
+    [
+        (lambda folder: None, "ok"),
+        (refuse, "refused"),
+        (lambda folder: 1 / 0, "failed ZeroDivisionError"),
+        (leave, "failed Broken: left behind after a refusal"),
+        (stray, "failed Broken: written outside"),
+        (cut_short, "failed Broken: half-written"),
+    ],
+)
 def test_what_counts_as_a_failure(attempt, outcome, tmp_path, monkeypatch):
     monkeypatch.setitem(targets.TARGETS, "one", target(first_well(attempt)))
     targets.TARGETS["one"].prepare(tmp_path / "inputs")
@@ -93,6 +114,7 @@ def test_crashes_and_hangs_are_seen():
 
 def test_much_of_the_processors_is_a_hang(tmp_path, monkeypatch):
     """Though the clock's limit is longer, as it is on a busy machine."""
+
     def work_hard(folder):
         while fuzz._processor_seconds() < end:
             sum(range(10_000))
@@ -107,10 +129,15 @@ def test_much_of_the_processors_is_a_hang(tmp_path, monkeypatch):
     os.close(writing)
 
 
-@pytest.mark.parametrize("name, content", [
-    ("a.json", b'{"a": [1, {"b": "c"}], "d": 2.5}'), ("a.xml", b'<scene version="3.0.0"><a b="1"/></scene>'),
-    ("a.txt", b"1 2 3\n4 5 6\n"), ("a.bin", bytes(range(256))),
-])
+@pytest.mark.parametrize(
+    "name, content",
+    [
+        ("a.json", b'{"a": [1, {"b": "c"}], "d": 2.5}'),
+        ("a.xml", b'<scene version="3.0.0"><a b="1"/></scene>'),
+        ("a.txt", b"1 2 3\n4 5 6\n"),
+        ("a.bin", bytes(range(256))),
+    ],
+)
 def test_damage_is_done_and_can_be_had_again(name, content, tmp_path):
     results = []
     for seed in [*range(20), *range(20)]:

@@ -12,21 +12,32 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "pipelines"))
 import judge_decisions
 
 
-@pytest.mark.parametrize(("change", "row"), [
-    (((0.2,), (0.05,), (True,), 0.5, 0.4),
-     "| mug | folds | +0.200 ± 0.050 | accepted | 0.500 → 0.400 | better |"),
-    (((-0.2, 0.1), (0.05, 0.01), (False, True), 0.5, 0.501),
-     "| mug | folds | +0.100 ± 0.010, -0.200 ± 0.050 | 1 of 2 accepted | 0.500 → 0.501 | same |"),
-])
+@pytest.mark.parametrize(
+    ("change", "row"),
+    [
+        (
+            ((0.2,), (0.05,), (True,), 0.5, 0.4),
+            "| mug | folds | +0.200 ± 0.050 | accepted | 0.500 → 0.400 | better |",
+        ),
+        (
+            ((-0.2, 0.1), (0.05, 0.01), (False, True), 0.5, 0.501),
+            "| mug | folds | +0.100 ± 0.010, -0.200 ± 0.050 | 1 of 2 accepted | 0.500 → 0.501 | same |",
+        ),
+    ],
+)
 def test_rows_of_changes(change, row):
     assert judge_decisions.Change("folds", *change).row("mug") == row
 
 
 def test_rows_of_openings():
-    row = {"images": "seed 0", "true": {"z": [5.0, 3.0], "accepted": [True, True]},
-           "false": {"z": [-4.0, -9.0], "accepted": [False, False]}}
+    row = {
+        "images": "seed 0",
+        "true": {"z": [5.0, 3.0], "accepted": [True, True]},
+        "false": {"z": [-4.0, -9.0], "accepted": [False, False]},
+    }
     assert judge_decisions.openings_row("mug", row) == (
-        "| mug | seed 0 | 2 of 2 | least +3.0 | 0 of 2 | largest -4.0 |")
+        "| mug | seed 0 | 2 of 2 | least +3.0 | 0 of 2 | largest -4.0 |"
+    )
 
 
 def test_holes_are_where_the_truth_is_closed(ball):

@@ -34,8 +34,14 @@ def test_damaged_files_are_found(recipe, tmp_path):
     log.write_text(json.dumps({"stage": "joint"}) + "\n" + '{"cut')
     (tmp_path / ".partial.mesh.ply").write_bytes(b"pl")
     assert recipe.read_everything(tmp_path) == 1
-    for name, text in (("mesh.ply", "ply\nformat"), ("metrics.json", "{"), ("report.html", "<html>"),
-                       ("scene.xml", "<scene>"), ("checkpoint.npz", "PK"), ("mesh.glb", "glTF")):
+    for name, text in (
+        ("mesh.ply", "ply\nformat"),
+        ("metrics.json", "{"),
+        ("report.html", "<html>"),
+        ("scene.xml", "<scene>"),
+        ("checkpoint.npz", "PK"),
+        ("mesh.glb", "glTF"),
+    ):
         path = tmp_path / name
         path.write_text(text)
         with pytest.raises(Exception):  # noqa: B017 - whatever the reader says
@@ -69,7 +75,9 @@ def test_kills(bowl_scene, tmp_path):
     assert "distance %: whole fits differ by" in result.stdout and "Traceback" not in result.stderr
     killed = tmp_path / "killed"
     assert not list(killed.rglob(".*"))
-    steps = [(entry["stage"], entry["iteration"])
-             for entry in map(json.loads, (killed / "log.jsonl").read_text().splitlines())]
+    steps = [
+        (entry["stage"], entry["iteration"])
+        for entry in map(json.loads, (killed / "log.jsonl").read_text().splitlines())
+    ]
     counts = {"openings": 5, "cavities": 4, "refinement": 2, "joint": 12}
     assert steps == [(stage, i) for stage, count in counts.items() for i in range(count)]

@@ -61,8 +61,9 @@ def truths(folder: Path) -> list[dict]:
 
 def pixels(folder: Path, what: str) -> np.ndarray:
     """(views, h, w[, 3]) in steps of 1/255."""
-    return np.array([np.array(Image.open(path), float)
-                     for path in sorted((folder / "capture" / what).iterdir())])
+    return np.array(
+        [np.array(Image.open(path), float) for path in sorted((folder / "capture" / what).iterdir())]
+    )
 
 
 def linear(encoded: np.ndarray) -> np.ndarray:
@@ -160,11 +161,14 @@ def test_faults_do_not_depend_on_each_other():
         assert not np.array_equal(other.standard_normal(4), before)
 
 
-@pytest.mark.parametrize(("size", "complaint"), [
-    ({"noise": -1.0}, "--noise must not be negative, and is -1"),
-    ({"gloss": 2.0}, "--gloss must lie in 0 to 0.95, and is 2"),
-    ({"mask_pixels": math.nan}, "--mask-pixels must not be negative, and is nan"),
-])
+@pytest.mark.parametrize(
+    ("size", "complaint"),
+    [
+        ({"noise": -1.0}, "--noise must not be negative, and is -1"),
+        ({"gloss": 2.0}, "--gloss must lie in 0 to 0.95, and is 2"),
+        ({"mask_pixels": math.nan}, "--mask-pixels must not be negative, and is nan"),
+    ],
+)
 def test_sizes_that_are_none(size, complaint):
     with pytest.raises(UserError, match=complaint):
         Faults(**size)
@@ -225,7 +229,7 @@ def test_stand_hides_the_lower_rim_in_level_views_only(photographs):
         gone = first - second
         assert gone.min() >= 0 and gone.sum() > 0.01 * first.sum()
         rows = np.nonzero(first.any(1))[0]
-        assert not gone[:int(rows[0] + 0.6 * np.ptp(rows))].any(), "only what is low"
+        assert not gone[: int(rows[0] + 0.6 * np.ptp(rows))].any(), "only what is low"
 
 
 def test_noise_is_as_strong_as_told(photographs):
@@ -256,10 +260,11 @@ def test_command(tmp_path, monkeypatch, capsys):
     assert sizes == dataclasses.asdict(only(mask_erosion=1.0))
     capsys.readouterr()
     for mistaken, complaint in (
-            (command, f"'{tmp_path / 'skirt'}' exists already; name a new folder."),
-            ([*command[:1], str(tmp_path / "b"), "--stand", "80"], "--stand must lie in 0 to 50, and is 80."),
-            (["none.xml", str(tmp_path / "b")], "'none.xml' does not exist; give a scene's reference.xml."),
-            ([*command[:1], str(tmp_path / "b"), "--views", "1"], "A capture takes at least 4 views")):
+        (command, f"'{tmp_path / 'skirt'}' exists already; name a new folder."),
+        ([*command[:1], str(tmp_path / "b"), "--stand", "80"], "--stand must lie in 0 to 50, and is 80."),
+        (["none.xml", str(tmp_path / "b")], "'none.xml' does not exist; give a scene's reference.xml."),
+        ([*command[:1], str(tmp_path / "b"), "--views", "1"], "A capture takes at least 4 views"),
+    ):
         assert make_photographed_capture.main(mistaken) == 2
         assert complaint in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["skirt"], "nothing is left behind"

@@ -21,12 +21,26 @@ from gshell_mi.scene import load_fit_scene
 def test_phases_of_a_step(bowl_scene):
     fit = load_fit_scene(bowl_scene)
     material = MaterialField(np.full((fit.subject.lattice.vertex_count, 3), 0.5))
-    joint = JointStage(fit, material, EnvironmentLight.uniform(4, 1.0),
-                       FitConfig(iterations=10, render=RenderConfig(spp=1, primal_spp=1, max_depth=2),
-                                 model=ModelConfig(light_height=4)))
+    joint = JointStage(
+        fit,
+        material,
+        EnvironmentLight.uniform(4, 1.0),
+        FitConfig(
+            iterations=10,
+            render=RenderConfig(spp=1, primal_spp=1, max_depth=2),
+            model=ModelConfig(light_height=4),
+        ),
+    )
     seconds, free = profile_iteration.seconds_per_phase(joint, 2, 1, iter(range(1000)).__next__)
-    assert set(seconds) == {"extraction", "scene update", "render", "losses", "backward", "render backward",
-                            "optimiser"}
+    assert set(seconds) == {
+        "extraction",
+        "scene update",
+        "render",
+        "losses",
+        "backward",
+        "render backward",
+        "optimiser",
+    }
     assert free == 1 and min(seconds.values()) > 0
 
 

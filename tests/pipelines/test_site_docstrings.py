@@ -36,7 +36,9 @@ Raises:
 
 >>> twice(1)
 2"""
-    assert site.shown(docstring) == """\
+    assert (
+        site.shown(docstring)
+        == """\
 Doubles.
 
 Args:
@@ -57,6 +59,7 @@ Raises:
 >>> twice(1)
 2
 ```"""
+    )
 
 
 def test_comments_of_values(site):

@@ -35,8 +35,17 @@ def test_every_public_module_is_on_one_page(site):
 
 
 def test_hidden_modules_and_stages_of_the_fit_are_left_out(site, tmp_path):
-    for path in ("a.py", "_hidden.py", "room/__init__.py", "room/b.py", "room/__main__.py", "fit/__init__.py",
-                 "fit/config.py", "fit/stage/__init__.py", "fit/stage/c.py"):
+    for path in (
+        "a.py",
+        "_hidden.py",
+        "room/__init__.py",
+        "room/b.py",
+        "room/__main__.py",
+        "fit/__init__.py",
+        "fit/config.py",
+        "fit/stage/__init__.py",
+        "fit/stage/c.py",
+    ):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).touch()
     assert site.public_modules(tmp_path) == ["a", "fit", "fit.config", "room", "room.b"]

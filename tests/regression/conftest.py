@@ -9,8 +9,12 @@ def pytest_addoption(parser):
     group = parser.getgroup("regression net")
     group.addoption("--update", action="store_true", help="store what is found as what is expected")
     group.addoption("--fresh", action="store_true", help="make every fit anew")
-    group.addoption("--fits", type=Path, default=Path("out/regression"),
-                    help="folder of the fits and their table (default out/regression)")
+    group.addoption(
+        "--fits",
+        type=Path,
+        default=Path("out/regression"),
+        help="folder of the fits and their table (default out/regression)",
+    )
 
 
 @pytest.fixture(scope="session")

@@ -48,8 +48,16 @@ class Net:
         verdict = f"**left its band: {', '.join(FIGURES[name].title for name in left)}**" if left else "held"
         self._note(case, outcome, before, verdict, left)
         if left:
-            pytest.fail("\n".join([f"{case.name} is worse than what is stored:", *left.values(),
-                                   f"The fits so far are in {self.table}."]), pytrace=False)
+            pytest.fail(
+                "\n".join(
+                    [
+                        f"{case.name} is worse than what is stored:",
+                        *left.values(),
+                        f"The fits so far are in {self.table}.",
+                    ]
+                ),
+                pytrace=False,
+            )
 
     def _outcome(self, case: Case) -> Outcome:
         trial = case.prepare(self.output)
@@ -67,15 +75,26 @@ class Net:
         print(f"\n{case.name}: {'; '.join(changes) or 'nothing changes'}")
         self._note(case, outcome, before, "stored" if changes else "stored, unchanged")
 
-    def _note(self, case: Case, outcome: Outcome, before: Expectation, verdict: str,
-              left: dict[str, str] | None = None) -> None:
+    def _note(
+        self,
+        case: Case,
+        outcome: Outcome,
+        before: Expectation,
+        verdict: str,
+        left: dict[str, str] | None = None,
+    ) -> None:
         """Adds a line to the table, and the heading before the first of a run."""
         self.output.mkdir(parents=True, exist_ok=True)
         lines = []
         if not self._rows:
             titles = [figure.title for figure in FIGURES.values()]
-            lines += ["", f"## {time.strftime('%Y-%m-%d %H:%M')}, code {code_version()}", "",
-                      f"| case | {' | '.join(titles)} | CPU s | |", "|---" * (len(titles) + 3) + "|"]
+            lines += [
+                "",
+                f"## {time.strftime('%Y-%m-%d %H:%M')}, code {code_version()}",
+                "",
+                f"| case | {' | '.join(titles)} | CPU s | |",
+                "|---" * (len(titles) + 3) + "|",
+            ]
         self._rows += 1
         cells = [_cell(name, outcome, before, name in (left or ())) for name in FIGURES]
         seconds = "-" if outcome.cpu_seconds is None else f"{outcome.cpu_seconds:.0f}"

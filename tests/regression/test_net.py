@@ -19,11 +19,18 @@ def scores(*, loops=2, pinholes=0, rim=1.0, chamfer=0.2, psnr=30.0, true_loops=2
     def count(found, reference):
         return {"found": found, "reference": reference}
 
-    return {"mesh": {"boundary_loops": count(loops, true_loops), "pinholes": count(pinholes, 0),
-                     "components": count(1, 1), "nonmanifold_edges": count(0, 0),
-                     "boundary_length": count(rim * 3.0, 3.0 if true_loops else 0.0), "chamfer": chamfer,
-                     "f_score": 0.9},
-            "mean": {"psnr": psnr, "mask_iou": 0.98}}
+    return {
+        "mesh": {
+            "boundary_loops": count(loops, true_loops),
+            "pinholes": count(pinholes, 0),
+            "components": count(1, 1),
+            "nonmanifold_edges": count(0, 0),
+            "boundary_length": count(rim * 3.0, 3.0 if true_loops else 0.0),
+            "chamfer": chamfer,
+            "f_score": 0.9,
+        },
+        "mean": {"psnr": psnr, "mask_iou": 0.98},
+    }
 
 
 @pytest.fixture
@@ -36,6 +43,7 @@ def case(tmp_path, monkeypatch):
 @pytest.fixture
 def found(monkeypatch):
     """Stands in for the fits: what the next one comes to, and how many there were."""
+
     class Found:
         outcome = Outcome({}, scores(), 100.0, 60.0, "abc")
         fits = 0
@@ -69,14 +77,17 @@ def test_stored_numbers_lie_in_their_bands(case):
         assert set(FIGURES) - {"rim"} <= set(expectation.figures)
 
 
-@pytest.mark.parametrize(("change", "title", "sentence"), [
-    ({"loops": 3}, "loops", "loops is 3, 1 above its band, which ends at 2"),
-    ({"loops": 1}, "loops", "loops is 1, 1 below its band, which ends at 2"),
-    ({"pinholes": 4}, "pin-holes", "pin-holes is 4, 4 above its band, which ends at 0"),
-    ({"rim": 1.05}, "rim", "rim is 1.05, 0.02 above its band, which ends at 1.03"),
-    ({"chamfer": 0.25}, "chamfer %", "chamfer % is 0.250, 0.030 above its band, which ends at 0.220"),
-    ({"psnr": 29.0}, "novel dB", "novel dB is 29.00, 0.40 below its band, which ends at 29.40"),
-])
+@pytest.mark.parametrize(
+    ("change", "title", "sentence"),
+    [
+        ({"loops": 3}, "loops", "loops is 3, 1 above its band, which ends at 2"),
+        ({"loops": 1}, "loops", "loops is 1, 1 below its band, which ends at 2"),
+        ({"pinholes": 4}, "pin-holes", "pin-holes is 4, 4 above its band, which ends at 0"),
+        ({"rim": 1.05}, "rim", "rim is 1.05, 0.02 above its band, which ends at 1.03"),
+        ({"chamfer": 0.25}, "chamfer %", "chamfer % is 0.250, 0.030 above its band, which ends at 0.220"),
+        ({"psnr": 29.0}, "novel dB", "novel dB is 29.00, 0.40 below its band, which ends at 29.40"),
+    ],
+)
 def test_what_is_worse_leaves_its_band(change, title, sentence):
     expectation = Expectation.of(scores(), "abc")
     left = expectation.left(scores(**change))
@@ -102,13 +113,21 @@ def test_expectations_come_back(tmp_path):
         assert Expectation.load(tmp_path / "case.json") == expectation
     assert difference(Expectation(None, {}), Expectation.of(scores(), "abc"))[0] == "loops: - → 2"
     assert difference(Expectation.of(scores(), "a"), Expectation.of(scores(chamfer=0.3), "b")) == [
-        "chamfer %: 0.200 → 0.300"]
+        "chamfer %: 0.200 → 0.300"
+    ]
 
 
-@pytest.mark.parametrize("text", [
-    "{", "[]", "{}", '{"measured": true, "fitted_by": null, "figures": {}}',
-    '{"measured": true, "fitted_by": null, "figures": {"beauty": {"stored": 1, "least": 0, "most": 2}}}',
-    '{"measured": true, "fitted_by": null, "figures": {"chamfer": {"stored": 1}}}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        "{}",
+        '{"measured": true, "fitted_by": null, "figures": {}}',
+        '{"measured": true, "fitted_by": null, "figures": {"beauty": {"stored": 1, "least": 0, "most": 2}}}',
+        '{"measured": true, "fitted_by": null, "figures": {"chamfer": {"stored": 1}}}',
+    ],
+)
 def test_damaged_expectations_are_told(tmp_path, text):
     (tmp_path / "case.json").write_text(text)
     with pytest.raises(UserError, match=r"case.json'.* make regress ARGS=--update"):
@@ -135,7 +154,8 @@ def test_update_then_hold_then_fail(case, found, tmp_path, capsys):
         net.run(case)
     assert str(told.value).splitlines()[1:3] == [
         "loops is 1, 1 below its band, which ends at 2",
-        "chamfer % is 0.300, 0.080 above its band, which ends at 0.220"]
+        "chamfer % is 0.300, 0.080 above its band, which ends at 0.220",
+    ]
 
     lines = net.table.read_text().splitlines()
     assert [line[:3] for line in lines if line.startswith("##")] == ["## ", "## "], "a heading per run"
@@ -171,9 +191,11 @@ def test_small_scene_has_fewer_and_smaller_views_of_the_same_truth(tmp_path):
     assert [sensor.id() for sensor in small] == [sensor.id() for sensor in stock][::8]
     assert {tuple(sensor.film().crop_size()) for sensor in small} == {(32, 32)}
     assert [sensor.id() for sensor in load_scene(tmp_path / "small_leaf" / "reference.xml").sensors()] == [
-        sensor.id() for sensor in small]
+        sensor.id() for sensor in small
+    ]
     assert (tmp_path / "small_leaf" / "truth.ply").read_bytes() == (
-        cases.SCENES / "leaf" / "truth.ply").read_bytes()
+        cases.SCENES / "leaf" / "truth.ply"
+    ).read_bytes()
     trial = SMALL.prepare(tmp_path / "again")
     assert trial.config == FitConfig() and trial.scene.stem == SMALL.name
 

@@ -29,13 +29,17 @@ SMALL = ReportConfig(turntable_frames=3, turntable_size=64, turntable_spp=2, vie
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 
 
-TRAINING = {"views": {"view_000": {"psnr": 31.5, "psnr_inside": 30.0, "ssim": 0.95, "flip": 0.04,
-                                   "mask_iou": 0.98},
-                      "view_001": {"psnr": 31.0, "mask_iou": None}},
-            "mean": {"psnr": 31.25, "psnr_inside": 30.0, "ssim": 0.95, "flip": 0.04, "mask_iou": 0.98}}
-HELD_OUT = {"views": {"view_003": {"psnr": 29.0, "mask_iou": 0.81}, "view_004": {"psnr": 28.0,
-                                                                                 "mask_iou": 0.92}},
-            "mean": {"psnr": 28.5, "mask_iou": 0.865}}
+TRAINING = {
+    "views": {
+        "view_000": {"psnr": 31.5, "psnr_inside": 30.0, "ssim": 0.95, "flip": 0.04, "mask_iou": 0.98},
+        "view_001": {"psnr": 31.0, "mask_iou": None},
+    },
+    "mean": {"psnr": 31.25, "psnr_inside": 30.0, "ssim": 0.95, "flip": 0.04, "mask_iou": 0.98},
+}
+HELD_OUT = {
+    "views": {"view_003": {"psnr": 29.0, "mask_iou": 0.81}, "view_004": {"psnr": 28.0, "mask_iou": 0.92}},
+    "mean": {"psnr": 28.5, "mask_iou": 0.865},
+}
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +59,29 @@ def folder(tmp_path_factory):
             image = Image.fromarray(triptych if name == "held_out" else overlay)
             image.save(folder / name / f"view_{number:03}.png")
     mesh = open_sphere(3)
-    (folder / "metrics.json").write_text(json.dumps({
-        "scene": "ball <&>.xml", "psnr_training": 31.25, "training": TRAINING, "held_out": HELD_OUT,
-        "counts": asdict(topology(mesh.vertices, mesh.faces)), "seconds": {"hull": 1.0, "total": 1.0},
-        "versions": {"gshell_mi": "0"}, "warnings": ["1 floater <here>"], "diagnostics": {"floaters": 1},
-        "poses": {"views": {"view_000": {"pixels": 0.3, "degrees": 0.02}}}, "peak_memory_mib": 900,
-        "variant": "llvm_ad_rgb", "config": asdict(FitConfig())}))
-    lines = [{"stage": "joint", "iteration": i, "loss": 0.1 / (i + 1), "psnr": 20 + i, "seconds": 0.1}
-             for i in range(5)]
+    (folder / "metrics.json").write_text(
+        json.dumps(
+            {
+                "scene": "ball <&>.xml",
+                "psnr_training": 31.25,
+                "training": TRAINING,
+                "held_out": HELD_OUT,
+                "counts": asdict(topology(mesh.vertices, mesh.faces)),
+                "seconds": {"hull": 1.0, "total": 1.0},
+                "versions": {"gshell_mi": "0"},
+                "warnings": ["1 floater <here>"],
+                "diagnostics": {"floaters": 1},
+                "poses": {"views": {"view_000": {"pixels": 0.3, "degrees": 0.02}}},
+                "peak_memory_mib": 900,
+                "variant": "llvm_ad_rgb",
+                "config": asdict(FitConfig()),
+            }
+        )
+    )
+    lines = [
+        {"stage": "joint", "iteration": i, "loss": 0.1 / (i + 1), "psnr": 20 + i, "seconds": 0.1}
+        for i in range(5)
+    ]
     (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     write_report(folder, SMALL)
     return folder
@@ -70,7 +89,7 @@ def folder(tmp_path_factory):
 
 def test_page_is_self_contained(folder):
     text = (folder / "report.html").read_text()
-    page = text[:text.index('<script type="module">')]
+    page = text[: text.index('<script type="module">')]
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert sources and all(source.startswith("data:") for source in sources)
     assert "ball &lt;&amp;&gt;" in page, "names are escaped"
@@ -83,12 +102,20 @@ def test_page_is_self_contained(folder):
 def test_corrections_come_largest_first(folder):
     page = (folder / "report.html").read_text().partition("<h2>Corrections</h2>")[2]
     assert "<tr><td>view_000</td><td>0.30</td><td>0.020</td><td>–</td></tr>" in page
-    metrics = {"poses": {"views": {"view_000": {"pixels": 0.3, "degrees": 0.02, "shift": 0.1},
-                                   "view_001": {"pixels": 1.2, "degrees": 0.2, "shift": 0.1}}},
-               "exposures": {"stops": {"view_001": -0.25, "view_002": 0.5}}}
-    assert correction_rows(metrics) == [("view_001", ["1.20", "0.200", "-0.250"]),
-                                        ("view_000", ["0.30", "0.020", "–"]),
-                                        ("view_002", ["–", "–", "0.500"])]
+    metrics = {
+        "poses": {
+            "views": {
+                "view_000": {"pixels": 0.3, "degrees": 0.02, "shift": 0.1},
+                "view_001": {"pixels": 1.2, "degrees": 0.2, "shift": 0.1},
+            }
+        },
+        "exposures": {"stops": {"view_001": -0.25, "view_002": 0.5}},
+    }
+    assert correction_rows(metrics) == [
+        ("view_001", ["1.20", "0.200", "-0.250"]),
+        ("view_000", ["0.30", "0.020", "–"]),
+        ("view_002", ["–", "–", "0.500"]),
+    ]
     assert correction_rows({}) == []
 
 
@@ -126,9 +153,15 @@ def test_a_fit_to_all_views(folder, tmp_path):
     assert "<h2>Training views</h2>" in page and "eld-out" not in page and "<h2>Masks</h2>" not in page
 
 
-METRICS = {"scene": "a.xml", "psnr_training": 30.0, "training": TRAINING, "versions": {},
-           "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1},
-           "seconds": {"total": 1.0}, "config": {}}
+METRICS = {
+    "scene": "a.xml",
+    "psnr_training": 30.0,
+    "training": TRAINING,
+    "versions": {},
+    "counts": {"vertices": 3, "faces": 1, "boundary_loops": 1, "components": 1},
+    "seconds": {"total": 1.0},
+    "config": {},
+}
 
 
 def test_metrics_of_a_fit_are_read(tmp_path):
@@ -136,26 +169,47 @@ def test_metrics_of_a_fit_are_read(tmp_path):
     assert read_metrics(tmp_path / "metrics.json") == METRICS
 
 
-@pytest.mark.parametrize(("text", "words"), [
-    ("{}", "'scene' is missing"), ("[]", "it is no object"), ("5", "it is no object"),
-    *((json.dumps({key: value for key, value in METRICS.items() if key != name}), f"'{name}' is missing")
-      for name in METRICS),
-    *((json.dumps(METRICS | change), words) for change, words in (
-        ({"scene": 5}, "'scene' is no str"), ({"psnr_training": "30"}, "'psnr_training' is no number"),
-        ({"psnr_training": float("nan")}, "'psnr_training' is no number"),
-        ({"psnr_training": 10**400}, "'psnr_training' is no number"),
-        ({"counts": [3]}, "'counts' is no dict"), ({"counts": {"vertices": 3}}, "'counts.faces' is no"),
-        ({"seconds": {}}, "'seconds.total' is no"), ({"training": {}}, "'training' holds"),
-        ({"training": TRAINING | {"mean": 5}}, "'training' holds"),
-        ({"held_out": 5}, "'held_out' is no dict"),
-        ({"poses": {"views": {"view_000": {"pixels": "many"}}}}, "'poses' or 'exposures' holds"),
-        ({"poses": {"views": [1]}}, "'poses' or 'exposures' holds"),
-        ({"exposures": {"stops": {"view_000": None}}}, "'poses' or 'exposures' holds"),
-        ({"held_out": {"views": {"a": {"psnr": None}}, "mean": {"psnr": 1}}}, "'held_out' holds"),
-        ({"held_out": {"views": {"a": {"psnr": 1, "ssim": "x"}}, "mean": {"psnr": 1}}}, "'held_out' holds"),
-        ({"warnings": "x"}, "'warnings' is no list"), ({"diagnostics": 1}, "'diagnostics' is no"),
-        ({"config": {"a": [[[[[[[[1]]]]]]]]}}, "it is nested too deeply"))),
-])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{}", "'scene' is missing"),
+        ("[]", "it is no object"),
+        ("5", "it is no object"),
+        *(
+            (
+                json.dumps({key: value for key, value in METRICS.items() if key != name}),
+                f"'{name}' is missing",
+            )
+            for name in METRICS
+        ),
+        *(
+            (json.dumps(METRICS | change), words)
+            for change, words in (
+                ({"scene": 5}, "'scene' is no str"),
+                ({"psnr_training": "30"}, "'psnr_training' is no number"),
+                ({"psnr_training": float("nan")}, "'psnr_training' is no number"),
+                ({"psnr_training": 10**400}, "'psnr_training' is no number"),
+                ({"counts": [3]}, "'counts' is no dict"),
+                ({"counts": {"vertices": 3}}, "'counts.faces' is no"),
+                ({"seconds": {}}, "'seconds.total' is no"),
+                ({"training": {}}, "'training' holds"),
+                ({"training": TRAINING | {"mean": 5}}, "'training' holds"),
+                ({"held_out": 5}, "'held_out' is no dict"),
+                ({"poses": {"views": {"view_000": {"pixels": "many"}}}}, "'poses' or 'exposures' holds"),
+                ({"poses": {"views": [1]}}, "'poses' or 'exposures' holds"),
+                ({"exposures": {"stops": {"view_000": None}}}, "'poses' or 'exposures' holds"),
+                ({"held_out": {"views": {"a": {"psnr": None}}, "mean": {"psnr": 1}}}, "'held_out' holds"),
+                (
+                    {"held_out": {"views": {"a": {"psnr": 1, "ssim": "x"}}, "mean": {"psnr": 1}}},
+                    "'held_out' holds",
+                ),
+                ({"warnings": "x"}, "'warnings' is no list"),
+                ({"diagnostics": 1}, "'diagnostics' is no"),
+                ({"config": {"a": [[[[[[[[1]]]]]]]]}}, "it is nested too deeply"),
+            )
+        ),
+    ],
+)
 def test_metrics_that_no_fit_wrote(folder, tmp_path, capsys, text, words):
     shutil.copytree(folder, tmp_path / "fit")
     (tmp_path / "fit" / "metrics.json").write_text(text)
@@ -173,12 +227,17 @@ def test_metrics_that_are_no_json(tmp_path, text):
         read_metrics(tmp_path / "metrics.json")
 
 
-@pytest.mark.parametrize(("name", "words"), [
-    ("mesh.glb", "mesh.glb' is damaged"),
-    ("views/view_000.png", "view_000.png' cannot be read as an image"),
-    ("held_out/view_003.png", "view_003.png' cannot be read as an image"),
-    ("masks/view_003.png", "view_003.png' cannot be read as an image"),
-    ("light.exr", "light.exr"), ("mesh.ply", "mesh.ply")])
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("mesh.glb", "mesh.glb' is damaged"),
+        ("views/view_000.png", "view_000.png' cannot be read as an image"),
+        ("held_out/view_003.png", "view_003.png' cannot be read as an image"),
+        ("masks/view_003.png", "view_003.png' cannot be read as an image"),
+        ("light.exr", "light.exr"),
+        ("mesh.ply", "mesh.ply"),
+    ],
+)
 @pytest.mark.parametrize("damage", [lambda data: b"", lambda data: b"garbage", lambda data: data[:30]])
 def test_damaged_files_of_a_fit(folder, tmp_path, capsys, name, words, damage):
     shutil.copytree(folder, tmp_path / "fit")
@@ -217,7 +276,7 @@ def test_a_folder_that_a_fit_is_writing(folder, tmp_path, capsys):
 
 def test_model_of_the_view(folder):
     data = viewer_model(folder)
-    document = json.loads(data[20:20 + int.from_bytes(data[12:16], "little")])
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     names = ["subject", "back faces", "template", "boundary loops"]
     assert [material["name"] for material in document["materials"]] == names
     subject = read_part(data)
@@ -277,8 +336,9 @@ def test_view_draws_and_its_parts_can_be_switched(page):
             box.set_checked(shown is not None and shown in box.locator("..").inner_text())
         page[0].wait_for_timeout(1500)
         drawn[shown] = picture(viewer)
-    changed = {shown: (np.abs(image - drawn[None]).max(-1) > 0.02).mean()
-               for shown, image in drawn.items() if shown}
+    changed = {
+        shown: (np.abs(image - drawn[None]).max(-1) > 0.02).mean() for shown, image in drawn.items() if shown
+    }
     assert changed["open mesh"] > 0.1 and changed["template"] > 0.1
     assert 0.0005 < changed["boundary loops"] < 0.1
 
@@ -301,12 +361,15 @@ def test_turntable_plays(page):
     assert page[0].evaluate(f"{video}.videoWidth") == SMALL.turntable_size
 
 
-@pytest.mark.parametrize("arguments, message", [
-    (("{none}",), "is missing or no JSON; give the folder of a finished fit"),
-    (("{fit}", "--views", "0"), "--views must be at least 1"),
-    (("{fit}", "--turntable-size", "33"), "must be even"),
-    (("{fit}", "--turntable-size", "10000000"), "GiB are free; lower its size or its samples"),
-])
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("{none}",), "is missing or no JSON; give the folder of a finished fit"),
+        (("{fit}", "--views", "0"), "--views must be at least 1"),
+        (("{fit}", "--turntable-size", "33"), "must be even"),
+        (("{fit}", "--turntable-size", "10000000"), "GiB are free; lower its size or its samples"),
+    ],
+)
 def test_mistakes(folder, tmp_path, capsys, arguments, message):
     assert main([argument.format(none=tmp_path / "none", fit=folder) for argument in arguments]) == 2
     error = capsys.readouterr().err

@@ -10,12 +10,7 @@ from topology import assert_manifold, loop_count
 from gshell_mi.extraction import extract
 from gshell_mi.fields import sphere
 from gshell_mi.lattice import TetLattice
-from gshell_mi.template.msdf import (
-    clean_opacity,
-    msdf_from_template,
-    splat_to_lattice,
-    without_specks,
-)
+from gshell_mi.template.msdf import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
 
 
 def test_small_cuts_and_islands_are_undone(ball):
@@ -56,8 +51,8 @@ def test_a_side_of_a_small_piece_is_no_speck(ball):
     logits = np.ones(len(vertices))
     logits[count:][cap(ball, [0, 0, 1], 0.6)[np.arange(2 * count) % count]] = -1
     cleaned = clean_opacity(logits, vertices, faces, min_area=0.02)
-    np.testing.assert_array_equal(cleaned[:2 * count], logits[:2 * count])
-    assert (cleaned[2 * count:] < 0).all()
+    np.testing.assert_array_equal(cleaned[: 2 * count], logits[: 2 * count])
+    assert (cleaned[2 * count :] < 0).all()
 
 
 @pytest.mark.parametrize("height", [-0.21, 0.0, 0.337])
@@ -129,8 +124,12 @@ def test_a_speck_in_a_thin_part_goes_and_leaves_the_other_side_open():
     template = extract(lattice, sdf, solid, still, template=True).template
     vertices = template.to_numpy()[0]
     upper = vertices[:, 2] > 0
-    specks = np.linalg.norm(vertices[:, None] - [[0.1, 0.1, 0.6 * cell], [-0.3, 0.2, 0.6 * cell]],
-                            axis=2).min(axis=1) < 0.8 * cell
+    specks = (
+        np.linalg.norm(vertices[:, None] - [[0.1, 0.1, 0.6 * cell], [-0.3, 0.2, 0.6 * cell]], axis=2).min(
+            axis=1
+        )
+        < 0.8 * cell
+    )
     msdf = msdf_from_template(np.where(upper & ~specks, 1.0, -1.0), template, lattice)
     assert loop_count(extract(lattice, sdf, msdf, still).to_numpy()[1]) > 1
     cleaned = without_specks(msdf, template, lattice, 0.02)

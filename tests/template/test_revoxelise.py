@@ -16,8 +16,9 @@ CELL = 2 / RESOLUTION
 
 def sphere(to_world: mi.ScalarTransform4f | None = None):
     """A gshell shape of radius 0.6 in lattice units, its template's vertices and faces."""
-    subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION,
-                            "to_world": to_world or mi.ScalarTransform4f()})
+    subject = mi.load_dict(
+        {"type": "gshell", "resolution": RESOLUTION, "to_world": to_world or mi.ScalarTransform4f()}
+    )
     radius = np.linalg.norm(subject.lattice.vertex_positions(), axis=1)
     subject.set_fields(LatticeFields.closed(radius - 0.6))
     vertices, faces, _ = subject.template().to_numpy()
@@ -32,8 +33,15 @@ def surface(subject, fields) -> trimesh.Trimesh:
 
 
 def counts(loops: int) -> Topology:
-    return Topology(vertices=0, faces=0, components=1, boundary_loops=loops, pinholes=0, boundary_length=0.0,
-                    nonmanifold_edges=0)
+    return Topology(
+        vertices=0,
+        faces=0,
+        components=1,
+        boundary_loops=loops,
+        pinholes=0,
+        boundary_length=0.0,
+        nonmanifold_edges=0,
+    )
 
 
 def solid(vertices) -> np.ndarray:
@@ -46,9 +54,17 @@ def test_a_sphere_that_grew(mirror):
     subject, vertices, faces = sphere(mi.ScalarTransform4f().translate([5, 0, 0]).scale(scale))
     centre = np.array([5.0, 0, 0])
     moved = centre + 1.2 * (vertices - centre)
-    fields = revoxelise(subject, subject.lattice, vertices, moved, faces, solid(vertices),
-                        np.abs(vertices - centre), 0.005,
-                        counts(0))
+    fields = revoxelise(
+        subject,
+        subject.lattice,
+        vertices,
+        moved,
+        faces,
+        solid(vertices),
+        np.abs(vertices - centre),
+        0.005,
+        counts(0),
+    )
     found = surface(subject, fields)
     radius = np.linalg.norm(found.vertices - centre, axis=1)
     np.testing.assert_allclose(radius, 1.44, atol=0.08 * 2 * CELL)
@@ -63,9 +79,17 @@ def test_a_sphere_that_grew(mirror):
 def test_the_opening_moves_along():
     subject, vertices, faces = sphere()
     logits = (0.2 - vertices[:, 1]) / CELL
-    fields = revoxelise(subject, subject.lattice, vertices, vertices * [1, 1.25, 1], faces, logits,
-                        np.ones((len(vertices), 3)),
-                        0.005, counts(1))
+    fields = revoxelise(
+        subject,
+        subject.lattice,
+        vertices,
+        vertices * [1, 1.25, 1],
+        faces,
+        logits,
+        np.ones((len(vertices), 3)),
+        0.005,
+        counts(1),
+    )
     found = surface(subject, fields)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
@@ -83,8 +107,17 @@ def test_a_sheet_stays_whole_and_in_its_place():
     vertices[:, 2] += top - CELL / 6
     logits = np.where(vertices[:, 2] > top - 0.1 * CELL, 0.5 - np.hypot(*vertices[:, :2].T), -1) / CELL
     subject, *_ = sphere()
-    fields = revoxelise(subject, subject.lattice, vertices, vertices, faces, logits,
-                        np.ones((len(vertices), 3)), 0.005, counts(1))
+    fields = revoxelise(
+        subject,
+        subject.lattice,
+        vertices,
+        vertices,
+        faces,
+        logits,
+        np.ones((len(vertices), 3)),
+        0.005,
+        counts(1),
+    )
     found = surface(subject, fields)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
@@ -96,8 +129,17 @@ def test_a_sheet_stays_whole_and_in_its_place():
 
 def test_a_collapse_goes_only_as_far_as_the_surface_lasts():
     subject, vertices, faces = sphere()
-    fields = revoxelise(subject, subject.lattice, vertices, np.zeros_like(vertices), faces, solid(vertices),
-                        np.ones((len(vertices), 3)), 0.005, counts(0))
+    fields = revoxelise(
+        subject,
+        subject.lattice,
+        vertices,
+        np.zeros_like(vertices),
+        faces,
+        solid(vertices),
+        np.ones((len(vertices), 3)),
+        0.005,
+        counts(0),
+    )
     radius = np.linalg.norm(surface(subject, fields).vertices, axis=1)
     np.testing.assert_allclose(radius, 0.3 * 0.6, atol=0.1 * CELL)
 
@@ -145,8 +187,9 @@ def test_a_slit_that_closes_becomes_a_bridge():
     moved[:, 0], moved[:, 1] = radius * np.cos(closed), radius * np.sin(closed) * np.sign(angle)
     cut = topology(*positive_part(vertices, faces, logits))
     assert cut.boundary_loops == 1
-    fields = revoxelise(subject, subject.lattice, vertices, moved, faces, logits, np.ones((len(vertices), 3)),
-                        0.005, cut)
+    fields = revoxelise(
+        subject, subject.lattice, vertices, moved, faces, logits, np.ones((len(vertices), 3)), 0.005, cut
+    )
     found = surface(subject, fields)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (2, 0, 1)

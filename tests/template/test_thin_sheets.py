@@ -28,8 +28,9 @@ def template(sdf: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def plate() -> tuple[np.ndarray, np.ndarray]:
     """A round plate of 1.6 cells, as a hull is grown to."""
     points = TetLattice(RESOLUTION).vertex_positions()
-    return template(np.maximum(np.abs(points[:, 2] - HEIGHT) - 0.8 * CELL,
-                               np.hypot(points[:, 0], points[:, 1]) - RADIUS))
+    return template(
+        np.maximum(np.abs(points[:, 2] - HEIGHT) - 0.8 * CELL, np.hypot(points[:, 0], points[:, 1]) - RADIUS)
+    )
 
 
 def flattened(vertices: np.ndarray, thickness: float) -> np.ndarray:
@@ -43,8 +44,9 @@ def flattened(vertices: np.ndarray, thickness: float) -> np.ndarray:
 
 def cut(vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, solid: np.ndarray) -> Cut | None:
     found = topology(vertices, faces[solid[faces].all(axis=1)])
-    return collapsed_sheets(Cut(np.where(solid, 3.0, -3.0), moved, found, found.boundary_loops), vertices,
-                            faces, CELL, 0.5, 0.005)
+    return collapsed_sheets(
+        Cut(np.where(solid, 3.0, -3.0), moved, found, found.boundary_loops), vertices, faces, CELL, 0.5, 0.005
+    )
 
 
 @pytest.mark.parametrize("thickness", [0.2, -0.2])
@@ -59,9 +61,18 @@ def test_of_a_sheet_one_side_is_left(thickness):
     assert found.topology.boundary_loops == 1
 
     subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
-    fields = revoxelise(subject, subject.lattice, vertices, found.positions, faces, found.logits,
-                        np.ones((len(vertices), 3)),
-                        0.005, found.topology, found.fewest_loops)
+    fields = revoxelise(
+        subject,
+        subject.lattice,
+        vertices,
+        found.positions,
+        faces,
+        found.logits,
+        np.ones((len(vertices), 3)),
+        0.005,
+        found.topology,
+        found.fewest_loops,
+    )
     closed = LatticeFields.closed(fields["sdf"])
     subject.set_fields(LatticeFields(closed.sdf, fields["msdf"], closed.deform))
     surface, surface_faces, _ = subject.surface.to_numpy()
@@ -69,8 +80,13 @@ def test_of_a_sheet_one_side_is_left(thickness):
     assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
     inner = np.hypot(surface[:, 0], surface[:, 1]) < RADIUS - 3 * CELL
     np.testing.assert_allclose(surface[inner, 2], HEIGHT, atol=0.35 * CELL)
-    area = 0.5 * np.linalg.norm(np.cross(surface[surface_faces[:, 1]] - surface[surface_faces[:, 0]],
-                                         surface[surface_faces[:, 2]] - surface[surface_faces[:, 0]]), axis=1)
+    area = 0.5 * np.linalg.norm(
+        np.cross(
+            surface[surface_faces[:, 1]] - surface[surface_faces[:, 0]],
+            surface[surface_faces[:, 2]] - surface[surface_faces[:, 0]],
+        ),
+        axis=1,
+    )
     assert area.sum() == pytest.approx(np.pi * RADIUS**2, rel=0.2)
 
 

@@ -21,9 +21,15 @@ def views(elevation: float, count: int = 12) -> PinholeViews:
     for azimuth in 2 * np.pi * np.arange(count) / count:
         around = np.cos(elevation) * np.array([np.cos(azimuth), np.sin(azimuth)])
         origin = DISTANCE * np.array([*around, np.sin(elevation)])
-        sensors.append(mi.load_dict({
-            "type": "perspective", "fov": 30,
-            "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 0, 1])}))
+        sensors.append(
+            mi.load_dict(
+                {
+                    "type": "perspective",
+                    "fov": 30,
+                    "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 0, 1]),
+                }
+            )
+        )
     return PinholeViews.from_sensors(sensors)
 
 

@@ -58,9 +58,10 @@ def is_orange(image) -> np.ndarray:
 
 
 def test_orange_back_faces_only_inside(folder):
-    plain, orange = (frame(folder, channel="roughness", elevation=60.0, orange_back=back)
-                     for back in (False, True))
-    assert is_orange(plain).sum() == 0 and is_orange(orange).sum() > 0.05 * SIZE ** 2
+    plain, orange = (
+        frame(folder, channel="roughness", elevation=60.0, orange_back=back) for back in (False, True)
+    )
+    assert is_orange(plain).sum() == 0 and is_orange(orange).sum() > 0.05 * SIZE**2
     from_below = frame(folder, channel="roughness", elevation=-80.0, orange_back=True)
     assert is_orange(from_below).sum() == 0
 
@@ -108,8 +109,9 @@ def test_objects_of_any_size_are_seen(scale):
         assert sensor.near_clip() < distances.min() and distances.max() < sensor.far_clip()
 
 
-@pytest.mark.parametrize("cut, words", [("sensor", "has no sensors"), ("emitter", "has no light"),
-                                        ("shape", "has no shape")])
+@pytest.mark.parametrize(
+    "cut, words", [("sensor", "has no sensors"), ("emitter", "has no light"), ("shape", "has no shape")]
+)
 def test_scenes_that_no_fit_wrote(cut, words, tmp_path):
     folder = write_fit(tmp_path, open_sphere(1), views=1, size=8)
     text = (folder / "scene.xml").read_text(encoding="utf-8")
@@ -135,8 +137,10 @@ def films(folder) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("name", ["-dash.mp4", "concat:a|b.mp4", "pipe:1.mp4", "tcp:127.0.0.1:9.mp4",
-                                  "a b;c.mp4", "%d.mp4", "$(x).mp4"])
+@pytest.mark.parametrize(
+    "name",
+    ["-dash.mp4", "concat:a|b.mp4", "pipe:1.mp4", "tcp:127.0.0.1:9.mp4", "a b;c.mp4", "%d.mp4", "$(x).mp4"],
+)
 def test_any_name_is_a_files(folder, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     options = ["--frames", "2", "--size", "32", "--spp", "1", "--quiet"]
@@ -208,25 +212,34 @@ def test_command(folder, tmp_path, capsys):
     assert str(out) in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments, message", [
-    (("{none}",), "holds no fit (scene.xml is missing)"),
-    (("{fit}", "--frames", "0"), "--frames must be at least 1"),
-    (("{fit}", "--size", "33"), "--size must be even"),
-    (("{fit}", "--fps", "0"), "--fps lies between"),
-    (("{fit}", "--size", "1000000"), "GiB are free; lower its size or its samples per pixel"),
-    (("{fit}", "--spp", "1000000000"), "GiB are free; lower its size or its samples per pixel"),
-    (("{fit}", "--max-depth", "1000000000000"), "--max-depth must be at least 2 (direct light) and at most"),
-    (("{fit}", "--elevation", "90"), "--elevation lies between"),
-    (("{fit}", "--max-depth", "1"), "--max-depth must be at least 2"),
-    (("{fit}", "--channel", "albedo"), "--channel 'albedo' is unknown; choose one of shaded"),
-    (("{fit}", "--envmap", "{none}"), "does not exist; check the path"),
-    (("{fit}", "--envmap", "{fit}/scene.xml"), "cannot be read"),
-    (("{fit}", "-o", "..", "--frames", "1", "--size", "16"), "is no name; give one such as turntable.mp4"),
-    (("{fit}", "-o", "/", "--frames", "1", "--size", "16"), "is no name; give one such as turntable.mp4"),
-    (("{fit}", "-o", "x" * 300, "--frames", "1", "--size", "16"), "is longer than 200 bytes"),
-    (("{fit}", "-o", "{fit}", "--frames", "1", "--size", "16"), "fit.mp4' exists and was not written by"),
-    (("{fit}", "-o", "{fit}/mesh.ply/turn.mp4", "--frames", "1", "--size", "16"), "cannot be written"),
-])
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("{none}",), "holds no fit (scene.xml is missing)"),
+        (("{fit}", "--frames", "0"), "--frames must be at least 1"),
+        (("{fit}", "--size", "33"), "--size must be even"),
+        (("{fit}", "--fps", "0"), "--fps lies between"),
+        (("{fit}", "--size", "1000000"), "GiB are free; lower its size or its samples per pixel"),
+        (("{fit}", "--spp", "1000000000"), "GiB are free; lower its size or its samples per pixel"),
+        (
+            ("{fit}", "--max-depth", "1000000000000"),
+            "--max-depth must be at least 2 (direct light) and at most",
+        ),
+        (("{fit}", "--elevation", "90"), "--elevation lies between"),
+        (("{fit}", "--max-depth", "1"), "--max-depth must be at least 2"),
+        (("{fit}", "--channel", "albedo"), "--channel 'albedo' is unknown; choose one of shaded"),
+        (("{fit}", "--envmap", "{none}"), "does not exist; check the path"),
+        (("{fit}", "--envmap", "{fit}/scene.xml"), "cannot be read"),
+        (
+            ("{fit}", "-o", "..", "--frames", "1", "--size", "16"),
+            "is no name; give one such as turntable.mp4",
+        ),
+        (("{fit}", "-o", "/", "--frames", "1", "--size", "16"), "is no name; give one such as turntable.mp4"),
+        (("{fit}", "-o", "x" * 300, "--frames", "1", "--size", "16"), "is longer than 200 bytes"),
+        (("{fit}", "-o", "{fit}", "--frames", "1", "--size", "16"), "fit.mp4' exists and was not written by"),
+        (("{fit}", "-o", "{fit}/mesh.ply/turn.mp4", "--frames", "1", "--size", "16"), "cannot be written"),
+    ],
+)
 def test_mistakes(folder, tmp_path, capsys, arguments, message):
     places = {"none": tmp_path / "none", "fit": folder}
     assert main([argument.format(**places) for argument in arguments] + ["--quiet"]) == 2

@@ -69,8 +69,17 @@ def test_it_serves_a_page(viewer):
 def test_a_client_receives_cameras_meshes_and_losses(viewer, bowl_scene):
     viewer.begin(load_fit_scene(bowl_scene))
     viewer.step("joint", 4, 20, {"loss": 0.1234, "psnr": 21.5}, preview)
-    receive(viewer, [b"/cameras/view_011", b"/open mesh", b"/template", b"glTF", b"**joint**, step 5 of 20",
-                     b"loss 0.1234"])
+    receive(
+        viewer,
+        [
+            b"/cameras/view_011",
+            b"/open mesh",
+            b"/template",
+            b"glTF",
+            b"**joint**, step 5 of 20",
+            b"loss 0.1234",
+        ],
+    )
 
 
 def test_it_takes_little_of_the_time(viewer):
@@ -155,11 +164,17 @@ def test_in_a_browser(viewer, bowl_scene):
 # --- who may look
 
 
-@pytest.mark.parametrize(("headers", "status"), [
-    ({}, 200), ({"Origin": "http://evil.example"}, 403), ({"Host": "evil.example"}, 403),
-    ({"Host": "localhost:9000", "Origin": "http://localhost:9000"}, 200),  # behind ssh -L
-    ({"Host": "localhost:9000", "Origin": "http://localhost:3000"}, 403), ({"Origin": "null"}, 403),
-])
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 200),
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Host": "evil.example"}, 403),
+        ({"Host": "localhost:9000", "Origin": "http://localhost:9000"}, 200),  # behind ssh -L
+        ({"Host": "localhost:9000", "Origin": "http://localhost:3000"}, 403),
+        ({"Origin": "null"}, 403),
+    ],
+)
 def test_it_answers_its_own_page_alone(viewer, headers, status):
     request = urllib.request.Request(viewer.url.replace("localhost", "127.0.0.1"), headers=headers)
     if status == 200:
@@ -170,8 +185,10 @@ def test_it_answers_its_own_page_alone(viewer, headers, status):
     assert refused.value.code == status and b"<html" not in refused.value.read()
 
 
-@pytest.mark.parametrize(("origin", "taken"), [("http://evil.example", False), ("http://127.0.0.1:1", False),
-                                               (None, True), ("own", True)])
+@pytest.mark.parametrize(
+    ("origin", "taken"),
+    [("http://evil.example", False), ("http://127.0.0.1:1", False), (None, True), ("own", True)],
+)
 def test_connections_of_other_origins_are_refused(viewer, origin, taken):
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect

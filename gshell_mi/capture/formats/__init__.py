@@ -12,8 +12,13 @@ from . import colmap, idr, llff, mitsuba, nerf
 FORMATS = {"nerf": nerf, "idr": idr, "colmap": colmap, "llff": llff, "mitsuba": mitsuba}
 
 
-def read_capture(source: str | Path, *, format: str | None = None, images: str | Path | None = None,
-                 opencv_axes: bool = False) -> Capture:
+def read_capture(
+    source: str | Path,
+    *,
+    format: str | None = None,
+    images: str | Path | None = None,
+    opencv_axes: bool = False,
+) -> Capture:
     """Reads a capture of any format.
 
     A Mitsuba variant must be set.
@@ -39,9 +44,12 @@ def read_capture(source: str | Path, *, format: str | None = None, images: str |
         raise UserError(
             f"'{source}' is no {'capture of the format ' + name if name else 'known capture'}: a folder with "
             f"transforms*.json (NeRF), cameras*.npz (IDR, NeuS), sparse/0 (COLMAP), poses_bounds.npy (LLFF) "
-            f"or an XML file of Mitsuba sensors is needed; Metashape and RealityScan export to COLMAP.")
+            f"or an XML file of Mitsuba sensors is needed; Metashape and RealityScan export to COLMAP."
+        )
     if opencv_axes and name != "nerf":
-        raise UserError(f"--opencv-axes is for NeRF's transforms.json, but '{source}' is of the format "
-                        f"{name}; leave it out.")
+        raise UserError(
+            f"--opencv-axes is for NeRF's transforms.json, but '{source}' is of the format "
+            f"{name}; leave it out."
+        )
     arguments = {"opencv_axes": True} if opencv_axes else {}
     return FORMATS[name].read(source, Path(images) if images else None, **arguments)

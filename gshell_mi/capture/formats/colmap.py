@@ -21,10 +21,21 @@ from ..frames import Capture, Frame, camera_for_image, pose_of
 
 #: Number in binary models, and how many parameters each has.
 _MODELS = {
-    "SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4), "SIMPLE_RADIAL": (2, 4), "RADIAL": (3, 5), "OPENCV": (4, 8),
+    "SIMPLE_PINHOLE": (0, 3),
+    "PINHOLE": (1, 4),
+    "SIMPLE_RADIAL": (2, 4),
+    "RADIAL": (3, 5),
+    "OPENCV": (4, 8),
 }
-_OTHER_MODELS = {5: "OPENCV_FISHEYE", 6: "FULL_OPENCV", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE",
-                 9: "RADIAL_FISHEYE", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE"}
+_OTHER_MODELS = {
+    5: "OPENCV_FISHEYE",
+    6: "FULL_OPENCV",
+    7: "FOV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+    10: "THIN_PRISM_FISHEYE",
+    11: "RAD_TAN_THIN_PRISM_FISHEYE",
+}
 _PLACES = ("", "sparse", "colmap/sparse", "colmap")
 
 
@@ -49,8 +60,14 @@ def _models(folder: Path) -> list[Path]:
 
 def _suffix(folder: Path) -> str | None:
     """Of the files of a model; the binary one if there are both."""
-    return next((suffix for suffix in (".bin", ".txt")
-                 if all(entry_of(folder, name + suffix).is_file() for name in ("cameras", "images"))), None)
+    return next(
+        (
+            suffix
+            for suffix in (".bin", ".txt")
+            if all(entry_of(folder, name + suffix).is_file() for name in ("cameras", "images"))
+        ),
+        None,
+    )
 
 
 def _image_count(model: Path) -> int:
@@ -80,8 +97,14 @@ def read(source: Path, images: Path | None = None) -> Capture:
     assert model is not None, "``find`` knows the source"
     images = images or _image_folder(source, model)
     others = [path for path in _models(model.parent) if path != model] if model != source else []
-    notes = [f"'{model.parent}' has {len(others) + 1} models; '{model.name}' is taken, as it has the most "
-             f"images: merge them in COLMAP (model_merger) for the others."] if others else []
+    notes = (
+        [
+            f"'{model.parent}' has {len(others) + 1} models; '{model.name}' is taken, as it has the most "
+            f"images: merge them in COLMAP (model_merger) for the others."
+        ]
+        if others
+        else []
+    )
     suffix = _suffix(model)
     cameras_file, images_file = (entry_of(model, f"{name}{suffix}") for name in ("cameras", "images"))
     if suffix == ".bin":
@@ -93,12 +116,13 @@ def read(source: Path, images: Path | None = None) -> Capture:
     frames = []
     for name, (camera, quaternion, translation) in sorted(poses.items()):
         if camera not in cameras:
-            raise UserError(f"The COLMAP model in '{model}' has no camera {camera}, which '{name}' was taken "
-                            f"with; export the model again.")
+            raise UserError(
+                f"The COLMAP model in '{model}' has no camera {camera}, which '{name}' was taken "
+                f"with; export the model again."
+            )
         path = _image(images, name)
         pose = pose_of(_camera_to_world(quaternion, translation), f"image '{name}' of '{model}'")
-        frames.append(Frame(path, camera_for_image(_camera(*cameras[camera], pose),
-                                                   image_size(path), path)))
+        frames.append(Frame(path, camera_for_image(_camera(*cameras[camera], pose), image_size(path), path)))
     return Capture("COLMAP", source, tuple(frames), notes=tuple(notes))
 
 
@@ -116,11 +140,15 @@ def _image_folder(source: Path, model: Path) -> Path:
 
 
 def _camera_to_world(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    with np.errstate(all="ignore"):    # what is not finite, as of a quaternion of 0, is refused as a pose
+    with np.errstate(all="ignore"):  # what is not finite, as of a quaternion of 0, is refused as a pose
         w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    rotation = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
     return np.concatenate([rotation.T, -rotation.T @ translation[:, None]], axis=1)
 
 
@@ -138,8 +166,10 @@ def _camera(model: str, width: int, height: int, p: np.ndarray, pose: np.ndarray
 
 def _check_model(model: str, path: Path) -> None:
     if model not in _MODELS:
-        raise UserError(f"'{path}' has a camera of the model {model}, and only {', '.join(_MODELS)} are "
-                        f"supported; run `colmap image_undistorter` and import its output.")
+        raise UserError(
+            f"'{path}' has a camera of the model {model}, and only {', '.join(_MODELS)} are "
+            f"supported; run `colmap image_undistorter` and import its output."
+        )
 
 
 # --- text
@@ -188,7 +218,7 @@ def _read_images_txt(path: Path) -> dict[str, tuple[int, np.ndarray, np.ndarray]
         if not line.strip() or line.startswith("#"):
             continue
         keypoints_next = True
-        words = line.split(maxsplit=9)    # a name may hold spaces
+        words = line.split(maxsplit=9)  # a name may hold spaces
         try:
             values = np.array(words[1:8], dtype=np.float64)
             camera, name = int(words[8]), words[9].rstrip()
@@ -211,7 +241,7 @@ def _are_keypoints(line: str) -> bool:
         return False
     try:
         np.array([words[:3], words[-3:]], dtype=np.float64)
-    except ValueError:    # the last word of an image's line is its name
+    except ValueError:  # the last word of an image's line is its name
         return False
     return True
 
@@ -239,7 +269,7 @@ class _Reader:
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise self.cut_off()
-        name = self.data[self.at:end].decode("utf-8", errors="surrogateescape")
+        name = self.data[self.at : end].decode("utf-8", errors="surrogateescape")
         self.at = end + 1
         return name
 
@@ -269,7 +299,7 @@ def _read_images_bin(path: Path) -> dict[str, tuple[int, np.ndarray, np.ndarray]
     for _ in range(reader.take("Q")[0]):
         _, *values, camera = reader.take("i7di")
         name = reader.name()
-        reader.skip(24 * reader.take("Q")[0])    # keypoints: x, y, id of the 3-D point
+        reader.skip(24 * reader.take("Q")[0])  # keypoints: x, y, id of the 3-D point
         _check_new(name, poses, path)
         poses[name] = (camera, np.array(values[:4]), np.array(values[4:]))
     return poses

@@ -51,17 +51,23 @@ def read(source: Path, images: Path | None = None) -> Capture:
             unpacked = sum(entry.file_size for entry in stored.zip.infolist())
             if unpacked > _LARGEST:
                 raise ValueError(f"it unpacks to {unpacked >> 20} MiB")
-            arrays = {key: np.array(stored[key], dtype=np.float64) for key in stored.files
-                      if key.startswith(("world_mat_", "scale_mat_", "camera_mat_")) and "_inv" not in key}
+            arrays = {
+                key: np.array(stored[key], dtype=np.float64)
+                for key in stored.files
+                if key.startswith(("world_mat_", "scale_mat_", "camera_mat_")) and "_inv" not in key
+            }
     except Exception as error:
         raise UserError(f"'{path}' cannot be read ({error}); copy or export it again.") from error
     count = sum(key.startswith("world_mat_") for key in arrays)
     if count == 0:
-        raise UserError(f"'{path}' has no world_mat_0, so it holds no IDR or NeuS cameras; give another "
-                        "file.")
+        raise UserError(
+            f"'{path}' has no world_mat_0, so it holds no IDR or NeuS cameras; give another file."
+        )
     if count != len(files):
-        raise UserError(f"'{path}' has {count} cameras, but '{folder}' has {len(files)} images; remove or "
-                        f"add what does not belong.")
+        raise UserError(
+            f"'{path}' has {count} cameras, but '{folder}' has {len(files)} images; remove or "
+            f"add what does not belong."
+        )
     frames, regions = [], []
     for index, image in enumerate(files):
         owner = f"camera {index} of '{path}'"
@@ -93,8 +99,9 @@ def _camera(matrix: np.ndarray, given: np.ndarray | None, image: Path, owner: st
     center = -np.linalg.solve(projection[:, :3], projection[:, 3])
     intrinsic /= intrinsic[2, 2]
     if abs(intrinsic[0, 1]) > 1e-3 * intrinsic[0, 0]:
-        raise UserError(f"The world_mat of {owner} has skewed pixels, which are not supported; resample its "
-                        f"image.")
+        raise UserError(
+            f"The world_mat of {owner} has skewed pixels, which are not supported; resample its image."
+        )
     pose = pose_of(np.concatenate([rotation.T, center[:, None]], axis=1), owner)
     # Half a pixel: from integer centres to corners at integers.
     cx, cy = intrinsic[:2, 2] + 0.5
@@ -104,8 +111,10 @@ def _camera(matrix: np.ndarray, given: np.ndarray | None, image: Path, owner: st
 def _to_pixels(intrinsic: np.ndarray | None, size: tuple[int, int], owner: str) -> np.ndarray:
     """(3, 3) from camera axes to pixels with integer centres; ``camera_mat`` is for an image from -1 to 1."""
     if intrinsic is None or intrinsic.shape not in ((3, 3), (4, 4)) or not np.isfinite(intrinsic).all():
-        raise UserError(f"The world_mat of {owner} is a pose without a focal length, and there is no finite "
-                        f"camera_mat with it; export the cameras as K [R | t].")
+        raise UserError(
+            f"The world_mat of {owner} is a pose without a focal length, and there is no finite "
+            f"camera_mat with it; export the cameras as K [R | t]."
+        )
     width, height = size
     film = np.array([[width / 2, 0, (width - 1) / 2], [0, height / 2, (height - 1) / 2], [0, 0, 1]])
     return film @ intrinsic[:3, :3]

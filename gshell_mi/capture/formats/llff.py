@@ -46,12 +46,15 @@ def read(source: Path, images: Path | None = None) -> Capture:
     except Exception as error:
         raise UserError(f"'{path}' cannot be read ({error}); copy or export it again.") from error
     if rows.ndim != 2 or rows.shape[1] != 17:
-        raise UserError(f"'{path}' has the shape {rows.shape} where (images, 17) is expected; give LLFF's "
-                        f"own file.")
+        raise UserError(
+            f"'{path}' has the shape {rows.shape} where (images, 17) is expected; give LLFF's own file."
+        )
     files = images_in(folder)
     if len(files) != len(rows):
-        raise UserError(f"'{path}' has {len(rows)} poses, but '{folder}' has {len(files)} images; remove or "
-                        f"add what does not belong.")
+        raise UserError(
+            f"'{path}' has {len(rows)} poses, but '{folder}' has {len(files)} images; remove or "
+            f"add what does not belong."
+        )
     frames = []
     for index, (row, image) in enumerate(zip(rows, files, strict=True)):
         matrix = row[:15].reshape(3, 5)
@@ -60,8 +63,9 @@ def read(source: Path, images: Path | None = None) -> Capture:
         pose = pose_of(np.stack([right, down, -backward, center], axis=1), owner)
         height, width, focal = matrix[:, 4]
         if not np.isfinite(row).all():
-            raise UserError(f"The size, focal length or bounds of {owner} are NaN or infinite; export it "
-                            "again.")
+            raise UserError(
+                f"The size, focal length or bounds of {owner} are NaN or infinite; export it again."
+            )
         width, height = round(width), round(height)
         declared = Camera(width, height, focal, focal, width / 2, height / 2, pose)
         frames.append(Frame(image, camera_for_image(declared, image_size(image), image)))

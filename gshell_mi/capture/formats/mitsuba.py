@@ -20,22 +20,31 @@ NAME = "Mitsuba sensors"
 
 _Y_UP = np.array([0.0, 1.0, 0.0])
 #: Plugins by the names of their classes.
-_FILTERS = {"BoxFilter": "box", "GaussianFilter": "gaussian", "TentFilter": "tent",
-            "MitchellNetravaliFilter": "mitchell", "CatmullRomFilter": "catmullrom",
-            "LanczosSincFilter": "lanczos"}
+_FILTERS = {
+    "BoxFilter": "box",
+    "GaussianFilter": "gaussian",
+    "TentFilter": "tent",
+    "MitchellNetravaliFilter": "mitchell",
+    "CatmullRomFilter": "catmullrom",
+    "LanczosSincFilter": "lanczos",
+}
 
 
 def find(source: Path) -> Path | None:
     """The XML file: the given one, or the only one in the folder that has sensors."""
     if source.is_file():
         return source if source.suffix.lower() == ".xml" and is_scene_file(source) else None
-    found = [path for path in sorted(source.glob("*.xml")) if path.is_file() and is_scene_file(path)
-             and b"<sensor" in path.read_bytes()]
+    found = [
+        path
+        for path in sorted(source.glob("*.xml"))
+        if path.is_file() and is_scene_file(path) and b"<sensor" in path.read_bytes()
+    ]
     named = [path for path in found if path.name == "sensors.xml"]
     if len(found) > 1 and not named:
         names = ", ".join(path.name for path in found)
-        raise UserError(f"'{source}' has several XML files with sensors ({names}); give the one that you "
-                        "want.")
+        raise UserError(
+            f"'{source}' has several XML files with sensors ({names}); give the one that you want."
+        )
     return next(iter(named or found), None)
 
 
@@ -52,7 +61,7 @@ def read(source: Path, images: Path | None = None) -> Capture:
     path = find(source)
     assert path is not None, "``find`` knows the source"
     try:
-        path.read_text(encoding="utf-8")    # Mitsuba would take other bytes for names
+        path.read_text(encoding="utf-8")  # Mitsuba would take other bytes for names
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"'{path}' cannot be loaded by Mitsuba ({error}); correct the file.") from error
     sensors = load_scene(path).sensors()
@@ -64,13 +73,17 @@ def read(source: Path, images: Path | None = None) -> Capture:
     for index, sensor in enumerate(sensors):
         image = next((file for folder in folders if (file := existing(folder / sensor.id()))), None)
         if image is None:
-            raise UserError(f"Image '{folders[0] / sensor.id()}' of the sensor in '{path}' is missing, with "
-                            f"any suffix such as .exr; put it there or name its folder with --images.")
+            raise UserError(
+                f"Image '{folders[0] / sensor.id()}' of the sensor in '{path}' is missing, with "
+                f"any suffix such as .exr; put it there or name its folder with --images."
+            )
         camera = camera_of(sensor, views, index)
         width, height = image_size(image)
         if (width, height) != (camera.width, camera.height):
-            raise UserError(f"Image '{image}' is {width} x {height} pixels, but its sensor's film is "
-                            f"{camera.width} x {camera.height}; resize one of them.")
+            raise UserError(
+                f"Image '{image}' is {width} x {height} pixels, but its sensor's film is "
+                f"{camera.width} x {camera.height}; resize one of them."
+            )
         frames.append(Frame(image, camera))
     return Capture(NAME, source, tuple(frames), up=_Y_UP)
 

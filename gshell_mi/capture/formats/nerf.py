@@ -76,19 +76,24 @@ def _files(source: Path) -> list[tuple[Path, bool]]:
     found = _transforms(source)
     if len(found) != 1:
         names = ", ".join(path.name for path in found)
-        raise UserError(f"'{source}' has {names}, and neither transforms.json nor transforms_train.json; "
-                        f"give the file that you want instead of the folder.")
+        raise UserError(
+            f"'{source}' has {names}, and neither transforms.json nor transforms_train.json; "
+            f"give the file that you want instead of the folder."
+        )
     return [(found[0], False)]
 
 
-def _frames(path: Path, document: dict[str, Any], find: _Finder, held_out: bool,
-            opencv_axes: bool) -> list[Frame]:
+def _frames(
+    path: Path, document: dict[str, Any], find: _Finder, held_out: bool, opencv_axes: bool
+) -> list[Frame]:
     frames = []
     for index, entry in enumerate(document["frames"]):
         owner = f"frame {index} of '{path}'"
         if not isinstance(entry, dict):
-            raise UserError(f"Frame {index} of '{path}' is not an object with file_path and "
-                            f"transform_matrix; export the capture again.")
+            raise UserError(
+                f"Frame {index} of '{path}' is not an object with file_path and "
+                f"transform_matrix; export the capture again."
+            )
         image = find(path, entry.get("file_path"), owner)
         pose = pose_of(entry.get("transform_matrix"), owner)
         pose = pose if opencv_axes else Camera.opengl_pose(pose)
@@ -105,8 +110,10 @@ def _load(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise UserError(f"'{path}' is no JSON file ({error}); export the capture again.") from error
     if not isinstance(document, dict):
-        raise UserError(f"'{path}' holds a JSON {type(document).__name__} where an object with frames is "
-                        f"expected; export the capture again.")
+        raise UserError(
+            f"'{path}' holds a JSON {type(document).__name__} where an object with frames is "
+            f"expected; export the capture again."
+        )
     if not isinstance(document.get("frames"), list) or not document["frames"]:
         raise UserError(f"'{path}' has no list of frames; it is no NeRF capture, or an empty one.")
     return document
@@ -136,8 +143,9 @@ class _Finder:
 
 def _named(path: Path, name: object, owner: str) -> Path:
     if not isinstance(name, str) or not name.strip("/\\ ") or "\0" in name:
-        raise UserError(f"The file_path or mask_path of {owner} is not a file's name; export the capture "
-                        "again.")
+        raise UserError(
+            f"The file_path or mask_path of {owner} is not a file's name; export the capture again."
+        )
     return path.parent / name.replace("\\", "/")
 
 
@@ -160,8 +168,9 @@ def _held_out(document: dict[str, Any], frames: list[Frame], find: _Finder, path
         lists[key] = {find(path, name, f"'{key}' of '{path}'").resolve() for name in names}
         unknown = sorted(lists[key] - shown)
         if unknown:
-            raise UserError(f"'{key}' of '{path}' names '{unknown[0]}', which no frame shows; correct the "
-                            f"list.")
+            raise UserError(
+                f"'{key}' of '{path}' names '{unknown[0]}', which no frame shows; correct the list."
+            )
     if lists.get("train_filenames"):
         return shown - lists["train_filenames"]
     return set().union(*lists.values())
@@ -171,8 +180,10 @@ def _camera(values: dict[str, Any], pose: np.ndarray, image: Path, owner: str) -
     model = str(values.get("camera_model") or "").upper()
     other = model if model not in _MODELS else next((key for key in _OTHER_LENSES if values.get(key)), None)
     if other:
-        raise UserError(f"The camera of {owner} is of the kind {other}, which is not supported; undistort "
-                        f"the images to a pinhole camera first.")
+        raise UserError(
+            f"The camera of {owner} is of the kind {other}, which is not supported; undistort "
+            f"the images to a pinhole camera first."
+        )
 
     @overload
     def number(key: str, default: float, *, positive: bool = False) -> float: ...
@@ -187,8 +198,9 @@ def _camera(values: dict[str, Any], pose: np.ndarray, image: Path, owner: str) -
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
             raise UserError(f"'{key}' of {owner} is {_short(value)}, not a number; export the capture again.")
         if positive and value <= 0:
-            raise UserError(f"'{key}' of {owner} is {value:g}, and must be positive; export the capture "
-                            "again.")
+            raise UserError(
+                f"'{key}' of {owner} is {value:g}, and must be positive; export the capture again."
+            )
         return float(value)
 
     size = image_size(image)
@@ -198,11 +210,14 @@ def _camera(values: dict[str, Any], pose: np.ndarray, image: Path, owner: str) -
     fy = number("fl_y", positive=True) or _focal(number("camera_angle_y", positive=True), height, owner)
     fx, fy = fx or fy, fy or fx
     if fx is None or fy is None:
-        raise UserError(f"{owner[0].upper()}{owner[1:]} has no focal length: neither fl_x nor "
-                        f"camera_angle_x; add one, in pixels or radians.")
+        raise UserError(
+            f"{owner[0].upper()}{owner[1:]} has no focal length: neither fl_x nor "
+            f"camera_angle_x; add one, in pixels or radians."
+        )
     distortion = Distortion(*(number(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4")))
-    declared = Camera(width, height, fx, fy, number("cx", width / 2), number("cy", height / 2), pose,
-                      distortion)
+    declared = Camera(
+        width, height, fx, fy, number("cx", width / 2), number("cy", height / 2), pose, distortion
+    )
     return camera_for_image(declared, size, image)
 
 
@@ -215,6 +230,8 @@ def _focal(angle: float | None, size: int, owner: str) -> float | None:
     if angle is None:
         return None
     if angle >= math.pi:
-        raise UserError(f"The camera angle of {owner} is {angle:g}, but it is in radians and below pi; "
-                        f"convert it from degrees.")
+        raise UserError(
+            f"The camera angle of {owner} is {angle:g}, but it is in radians and below pi; "
+            f"convert it from degrees."
+        )
     return size / 2 / math.tan(angle / 2)

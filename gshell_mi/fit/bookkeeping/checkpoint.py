@@ -48,8 +48,9 @@ class Checkpoint:
 
     def part(self, prefix: str) -> dict[str, np.ndarray]:
         """The arrays whose names have a prefix, without it."""
-        found = {name.removeprefix(prefix): array for name, array in self.arrays.items()
-                 if name.startswith(prefix)}
+        found = {
+            name.removeprefix(prefix): array for name, array in self.arrays.items() if name.startswith(prefix)
+        }
         return _Arrays(found, self.arrays.path) if isinstance(self.arrays, _Arrays) else found
 
     def save(self, path: Path) -> None:
@@ -58,18 +59,28 @@ class Checkpoint:
         Raises:
             UserError: the folder is full or not writable; an older checkpoint stays as it was.
         """
-        header = json.dumps({"format": FORMAT, "stage": self.stage, "iteration": self.iteration,
-                             "config": self.config, "seconds": self.seconds, "facts": self.facts,
-                             "inputs": self.inputs,
-                             "arrays": {name: _kind(array) for name, array in self.arrays.items()}})
+        header = json.dumps(
+            {
+                "format": FORMAT,
+                "stage": self.stage,
+                "iteration": self.iteration,
+                "config": self.config,
+                "seconds": self.seconds,
+                "facts": self.facts,
+                "inputs": self.inputs,
+                "arrays": {name: _kind(array) for name, array in self.arrays.items()},
+            }
+        )
         try:
             with replacing(path) as partial, open(partial, "wb") as file:
                 np.savez(file, header=np.array(header), **dict[str, Any](self.arrays))
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise UserError(f"Checkpoint '{path}' cannot be written ({error.strerror}); free some space or "
-                            f"choose another folder with -o, then continue with --resume.") from error
+            raise UserError(
+                f"Checkpoint '{path}' cannot be written ({error.strerror}); free some space or "
+                f"choose another folder with -o, then continue with --resume."
+            ) from error
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:
@@ -84,13 +95,15 @@ class Checkpoint:
             with open(path, "rb") as file:
                 header, arrays = _read(file)
         except PermissionError as error:
-            raise UserError(f"Checkpoint '{path}' cannot be read ({error.strerror}); mend its "
-                            f"permissions.") from error
+            raise UserError(
+                f"Checkpoint '{path}' cannot be read ({error.strerror}); mend its permissions."
+            ) from error
         except Exception as error:
             raise _damaged(path, type(error).__name__) from error
         if header.pop("format", None) != FORMAT:
-            raise UserError(f"Checkpoint '{path}' was written by another version of gshell_mi; start without "
-                            f"--resume.")
+            raise UserError(
+                f"Checkpoint '{path}' was written by another version of gshell_mi; start without --resume."
+            )
         if problem := _problem(header, arrays):
             raise _damaged(path, problem)
         return cls(arrays=_Arrays(arrays, path), **header)
@@ -170,12 +183,17 @@ def restore_optimizer(name: str, optimizer: mi.ad.Adam, arrays: Mapping[str, np.
     """
     for key, (value, promoted, rate, (step, first, second, maximum)) in list(optimizer.state.items()):
         stored = {part: arrays[f"{name}/{key}/{part}"] for part in ("value", "step", "first", "second")}
-        if any(stored[part].shape != now.shape for part, now in (
-                ("value", value), ("step", step), ("first", first), ("second", second))):
-            raise UserError(f"The checkpoint's '{name}/{key}' has another size than this fit needs; start "
-                            f"again with --overwrite.")
+        if any(
+            stored[part].shape != now.shape
+            for part, now in (("value", value), ("step", step), ("first", first), ("second", second))
+        ):
+            raise UserError(
+                f"The checkpoint's '{name}/{key}' has another size than this fit needs; start "
+                f"again with --overwrite."
+            )
         restored = type(value)(stored["value"])
         dr.enable_grad(restored)
-        step, first, second = (type(old)(stored[part])
-                               for old, part in ((step, "step"), (first, "first"), (second, "second")))
+        step, first, second = (
+            type(old)(stored[part]) for old, part in ((step, "step"), (first, "first"), (second, "second"))
+        )
         optimizer.state[key] = (restored, promoted, rate, (step, first, second, maximum))

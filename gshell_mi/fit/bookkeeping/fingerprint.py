@@ -16,9 +16,12 @@ from ...targets import Target
 
 #: What a message calls the parts, and what they are where that is short.
 _PARTS = {
-    "lattice": "lattice: {before} instead of {now}", "box": "to_world of the gshell shape",
-    "fields": "fields of the gshell shape", "material": "material of the gshell shape",
-    "light": "initial light", "objects": "objects beside the gshell shape",
+    "lattice": "lattice: {before} instead of {now}",
+    "box": "to_world of the gshell shape",
+    "fields": "fields of the gshell shape",
+    "material": "material of the gshell shape",
+    "light": "initial light",
+    "objects": "objects beside the gshell shape",
 }
 
 
@@ -40,8 +43,9 @@ def fingerprint(scene: FitScene, lattice: Lattice) -> dict[str, Any]:
         "material": _of_parameters(scene.bsdf),
         "light": _of_parameters(scene.light),
         "objects": _digest(*map(_of_parameters, others)),
-        "views": {name: _of_parameters(view.sensor, view.sensor.film().rfilter())
-                  for name, view in views.items()},
+        "views": {
+            name: _of_parameters(view.sensor, view.sensor.film().rfilter()) for name, view in views.items()
+        },
         "targets": {name: _digest(*_arrays(view.target)) for name, view in views.items()},
     }
 
@@ -49,14 +53,16 @@ def fingerprint(scene: FitScene, lattice: Lattice) -> dict[str, Any]:
 def _arrays(target: Target) -> list[np.ndarray]:
     """What a target tells; that all of it is known, or no depths, adds nothing."""
     known = np.asarray(target.known)
-    return ([target.rgba] + ([] if target.depth is None else [target.depth])
-            + ([] if known.all() else [known]))
+    return [target.rgba] + ([] if target.depth is None else [target.depth]) + ([] if known.all() else [known])
 
 
 def check_fingerprint(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raises ``UserError`` if a checkpoint's fit was started with something else, and says what differs."""
-    differing = [text.format(before=before.get(name), now=now[name]) for name, text in _PARTS.items()
-                 if before.get(name) != now[name]]
+    differing = [
+        text.format(before=before.get(name), now=now[name])
+        for name, text in _PARTS.items()
+        if before.get(name) != now[name]
+    ]
     for name, text in (("views", "cameras"), ("targets", "images")):
         earlier, later = before.get(name) or {}, now[name]
         if name == "views" and earlier.keys() != later.keys():
@@ -67,8 +73,10 @@ def check_fingerprint(before: Mapping[str, Any], now: Mapping[str, Any]) -> None
         if changed:
             differing.append(f"{text} of {_some(changed)}")
     if differing:
-        raise UserError(f"The checkpoint's fit was started with other inputs ({', '.join(differing)}); "
-                        f"resume with the same, or start again with --overwrite.")
+        raise UserError(
+            f"The checkpoint's fit was started with other inputs ({', '.join(differing)}); "
+            f"resume with the same, or start again with --overwrite."
+        )
 
 
 def _some(names: list[str]) -> str:

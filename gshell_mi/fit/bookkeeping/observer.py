@@ -35,8 +35,9 @@ class Observer(Protocol):
     def begin(self, fit: FitScene) -> None:
         """Before the first stage."""
 
-    def step(self, stage: str, iteration: int, count: int, values: dict[str, float],
-             preview: Callable[[], Preview]) -> None:
+    def step(
+        self, stage: str, iteration: int, count: int, values: dict[str, float], preview: Callable[[], Preview]
+    ) -> None:
         """After each of the ``count`` steps of a stage.
 
         Args:

@@ -64,8 +64,10 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
         after = template_of(subject, carved, like=before)
     clean = partial(clean_opacity, vertices=after.vertices, faces=after.faces, min_area=min_area)
     cleaned = clean(after.logits)
-    was, became = (topology(*positive_part(template.vertices, template.faces, logits))
-                   for template, logits in ((before, before.logits), (after, cleaned)))
+    was, became = (
+        topology(*positive_part(template.vertices, template.faces, logits))
+        for template, logits in ((before, before.logits), (after, cleaned))
+    )
     if became.boundary_loops != was.boundary_loops or became.components > was.components:
         return None
     if not fit.config.watertight:
@@ -82,24 +84,31 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
     return replace(carved.with_fields(msdf=msdf.numpy()), seen=seen)
 
 
-def _in_empty_space(template: Template, volume: RadianceVolume, opacity: np.ndarray,
-                    seen: np.ndarray) -> np.ndarray:
+def _in_empty_space(
+    template: Template, volume: RadianceVolume, opacity: np.ndarray, seen: np.ndarray
+) -> np.ndarray:
     """(V,) whether there is nothing within a cell of a vertex, and it is seen."""
     local = volume.to_lattice @ mi.Point3f(np.ascontiguousarray(template.vertices.T, np.float32))
     index = ((local + 1) * (0.5 * volume.resolution)).numpy()[::-1]
     around = ndimage.gaussian_filter(opacity, 1.0)
-    return ((ndimage.map_coordinates(around, index, order=1) < _EMPTY)
-            & (ndimage.map_coordinates(seen, index, order=1) > SEEN))
+    return (ndimage.map_coordinates(around, index, order=1) < _EMPTY) & (
+        ndimage.map_coordinates(seen, index, order=1) > SEEN
+    )
 
 
-def _kept(fit: Fit, before: Template, after: Template, label: np.ndarray,
-          volume: RadianceVolume) -> np.ndarray:
+def _kept(
+    fit: Fit, before: Template, after: Template, label: np.ndarray, volume: RadianceVolume
+) -> np.ndarray:
     """(count,) which hollows explain unseen views better, by the rays that enter them."""
     local = volume.to_lattice @ mi.Point3f(np.ascontiguousarray(before.vertices.T, np.float32))
     index = np.rint(((local + 1) * (0.5 * volume.resolution)).numpy()[::-1]).astype(int)
     place = label[tuple(np.clip(index, 0, len(label) - 1))] - 1
-    verdict = fit.judge.compare(fit.judge.shown(before.surface).whole, fit.judge.shown(after.surface).whole,
-                                place, fit.judge.shown(before.closed))
+    verdict = fit.judge.compare(
+        fit.judge.shown(before.surface).whole,
+        fit.judge.shown(after.surface).whole,
+        place,
+        fit.judge.shown(before.closed),
+    )
     kept = np.zeros(label.max(), bool)
     kept[: len(verdict.accepted)] = verdict.accepted[: len(kept)]
     return kept

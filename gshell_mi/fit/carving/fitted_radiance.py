@@ -10,7 +10,14 @@ from ..template import Template
 def fitted_radiance(template: Template, fit: Fit) -> SurfaceRadiance:
     """The radiance of a template, fitted to the training views from grey."""
     mirrored = fit.held_out_judge.shown(template.surface).mirrored
-    appearance = SurfaceRadiance(template.start, template.faces, fit.views, fit.training, fit.config.radiance,
-                                 seed=fit.config.seed, mirrored=mirrored)
+    appearance = SurfaceRadiance(
+        template.start,
+        template.faces,
+        fit.views,
+        fit.training,
+        fit.config.radiance,
+        seed=fit.config.seed,
+        mirrored=mirrored,
+    )
     appearance.refit_anew(template.solid)
     return appearance

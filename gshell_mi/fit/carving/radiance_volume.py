@@ -68,9 +68,19 @@ class RadianceVolume:
         seed: of the random pixels.
     """
 
-    def __init__(self, hull: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
-                 to_world: mi.ScalarTransform4f, views: PinholeViews, pixels: PixelPool,
-                 config: CavitiesConfig, first: int = 0, *, seed: int = 0):
+    def __init__(
+        self,
+        hull: np.ndarray,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        to_world: mi.ScalarTransform4f,
+        views: PinholeViews,
+        pixels: PixelPool,
+        config: CavitiesConfig,
+        first: int = 0,
+        *,
+        seed: int = 0,
+    ):
         self.hull, self.views, self.pixels, self.config = hull, views, pixels, config
         self.seed = seed
         self.hull_surface = vertices, faces
@@ -93,8 +103,9 @@ class RadianceVolume:
         begin, end = (self.coarse_steps, config.iterations) if fine else (0, self.coarse_steps)
         decay = (0.1 if fine else 0.5) ** ((iteration - begin) / max(end - begin, 1))
         optimizer = self.optimizers["volume"]
-        optimizer.set_learning_rate({"density": decay * config.lr,
-                                     "radiance": decay * config.radiance_lr * self.mean_radiance})
+        optimizer.set_learning_rate(
+            {"density": decay * config.lr, "radiance": decay * config.radiance_lr * self.mean_radiance}
+        )
         rays, target, alpha = self._rays(iteration)
         radiance, transmittance = self._march(rays, iteration)
         dr.eval(radiance, transmittance)
@@ -112,8 +123,12 @@ class RadianceVolume:
         count = max(dr.width(transmittance), 1)
         error = dr.sum(dr.ravel(dr.square(adjoint[0] - target)))
         image, mask = image[0] / count, mask[0] / count
-        return {"loss": image + weight * mask, "image": image, "mask": mask,
-                "psnr": decibels(error[0] / (3 * count))}
+        return {
+            "loss": image + weight * mask,
+            "image": image,
+            "mask": mask,
+            "psnr": decibels(error[0] / (3 * count)),
+        }
 
     def opacity(self) -> np.ndarray:
         """(n + 1, n + 1, n + 1) opacity of one cell's length, in [0, 1]."""
@@ -138,8 +153,9 @@ class RadianceVolume:
 
     # --- grids
 
-    def _begin(self, resolution: int, density: np.ndarray | None = None,
-               radiance: np.ndarray | None = None) -> None:
+    def _begin(
+        self, resolution: int, density: np.ndarray | None = None, radiance: np.ndarray | None = None
+    ) -> None:
         """Grids of a resolution: even fog, or what is given."""
         self.resolution = resolution
         hull = self.hull
@@ -162,8 +178,11 @@ class RadianceVolume:
         factor = (resolution + 1) / old
         density = np.maximum(optimizer["density"].numpy(), 2 * _FOG).reshape(old, old, old)
         radiance = optimizer["radiance"].numpy().reshape(old, old, old, 3)
-        self._begin(resolution, ndimage.zoom(density, factor, order=1),
-                    ndimage.zoom(radiance, (factor, factor, factor, 1), order=1))
+        self._begin(
+            resolution,
+            ndimage.zoom(density, factor, order=1),
+            ndimage.zoom(radiance, (factor, factor, factor, 1), order=1),
+        )
 
     def _cube(self, values: mi.Float) -> np.ndarray:
         return values.numpy().reshape((self.resolution + 1,) * 3)
@@ -234,15 +253,25 @@ class RadianceVolume:
                 behind = dr.dot(final - total, by_radiance) + final_transmittance * by_transmittance
                 by_depth = _STEP * (remaining * dr.dot(color, by_radiance) - behind)
                 by_color = dr.select(color > 0, weight * by_radiance, 0)
-                dr.scatter_reduce(dr.ReduceOp.Add, gradient,
-                                  mi.Vector4f(by_color.x, by_color.y, by_color.z, by_depth), index, active)
+                dr.scatter_reduce(
+                    dr.ReduceOp.Add,
+                    gradient,
+                    mi.Vector4f(by_color.x, by_color.y, by_color.z, by_depth),
+                    index,
+                    active,
+                )
             transmittance = dr.select(active, remaining, transmittance)
             t = t + step
             return t, transmittance, total, active & (t < last) & (transmittance > _DARK), random
 
         count = dr.width(first)
-        state = (mi.Float(first), dr.full(mi.Float, 1, count), dr.zeros(mi.Color3f, count), first < last,
-                 mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed)))
+        state = (
+            mi.Float(first),
+            dr.full(mi.Float, 1, count),
+            dr.zeros(mi.Color3f, count),
+            first < last,
+            mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed)),
+        )
         _, transmittance, total, _, _ = dr.while_loop(state, lambda t, tr, c, active, r: active, body)
         return gradient if adjoint else (total, transmittance)
 
@@ -251,6 +280,8 @@ def _nearby_vertex(position: mi.Point3f, cells: mi.Float, side: mi.UInt32, rando
     """One of the eight vertices around a position, with the probability of its trilinear weight."""
     bits = random.next_uint32()
     uniform = (mi.Float((bits >> shift) & 0x3FF) / 1024 for shift in (2, 12, 22))
-    x, y, z = (mi.UInt32(dr.clip(dr.floor(coordinate + u), 0, cells))
-               for coordinate, u in zip(position, uniform, strict=True))
+    x, y, z = (
+        mi.UInt32(dr.clip(dr.floor(coordinate + u), 0, cells))
+        for coordinate, u in zip(position, uniform, strict=True)
+    )
     return x + side * (y + side * z)

@@ -139,8 +139,12 @@ class _Trials:
         for thickness, depth in others:
             mouth = best.hollow.mouth
             other = self._vessel(mouth, thickness, depth)
-            if other is None or not self.fit.judge.compare(
-                    best.shown.whole, other.shown.whole, np.where(mouth, 0, -1), self._closed).accepted[0]:
+            if (
+                other is None
+                or not self.fit.judge.compare(
+                    best.shown.whole, other.shown.whole, np.where(mouth, 0, -1), self._closed
+                ).accepted[0]
+            ):
                 break
             best = other
         return best
@@ -158,16 +162,19 @@ class _Trials:
     def _hollow(self, mouth: np.ndarray, thickness: float, depth: float) -> _Hollow | None:
         """What lies behind openings and deeper than a wall; None if that is nothing."""
         vertices, cell = self.template.vertices, self.fit.cell(self.surface)
-        to_wall, to_mouth = (cKDTree(vertices[chosen]).query(self._points)[0] / cell
-                             for chosen in (~mouth, mouth))
+        to_wall, to_mouth = (
+            cKDTree(vertices[chosen]).query(self._points)[0] / cell for chosen in (~mouth, mouth)
+        )
         # The wall ends at the opening's rim.
         within = np.maximum(to_wall - thickness, (to_wall - to_mouth) / np.sqrt(2))
         distance = np.full(self._inside.shape, -np.inf)
         distance[self._inside] = np.minimum(within, depth - to_mouth)
         part = ndimage.label((distance > 0).reshape((self.lattice.stride,) * 3))[0].ravel()
         owner = part[self._inside]
-        nearest, deepest = (extremum(to_mouth, owner, range(1 + part.max()))
-                            for extremum in (ndimage.minimum, ndimage.maximum))
+        nearest, deepest = (
+            extremum(to_mouth, owner, range(1 + part.max()))
+            for extremum in (ndimage.minimum, ndimage.maximum)
+        )
         # Thick parts elsewhere are no hollows, nor are dents.
         hollow = (np.arange(1 + part.max()) > 0) & (nearest < _BEHIND) & (deepest > _SHALLOW)
         if not hollow.any():

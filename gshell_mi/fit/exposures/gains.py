@@ -126,8 +126,9 @@ class _Model:
         noise = np.sqrt(REGIONS - 1) * told.std(axis=0)
         return noise, verdict_of(rays[None], before[None], after[None])
 
-    def _regression(self, chosen: np.ndarray, channel: int, *,
-                    exposed: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    def _regression(
+        self, chosen: np.ndarray, channel: int, *, exposed: bool = True
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Huber's robust regression.
 
         Args:
@@ -151,8 +152,9 @@ class _Model:
             matrix = np.block([[np.diag(of_view.T @ weight), cross], [cross.T, columns.T @ weighted]])
             right = np.concatenate([of_view.T @ value, columns.T @ value])
             # A place's colour is the mean of what is left there: that is eliminated.
-            of_place = np.concatenate([(seen.places @ (of_view * weight[:, None])).toarray(),
-                                       seen.places @ weighted], axis=1)
+            of_place = np.concatenate(
+                [(seen.places @ (of_view * weight[:, None])).toarray(), seen.places @ weighted], axis=1
+            )
             total = np.maximum(seen.places @ weight, 1e-12)
             matrix -= of_place.T @ (of_place / total[:, None])
             right -= of_place.T @ ((seen.places @ value) / total)
@@ -164,8 +166,14 @@ class _Model:
         return found[:views], found[views:]
 
 
-def _residual(seen: Observations, columns: np.ndarray, channel: int, weight: np.ndarray, gain: np.ndarray,
-              coefficients: np.ndarray) -> np.ndarray:
+def _residual(
+    seen: Observations,
+    columns: np.ndarray,
+    channel: int,
+    weight: np.ndarray,
+    gain: np.ndarray,
+    coefficients: np.ndarray,
+) -> np.ndarray:
     """(E,) what is left of the logarithms, where each place has the colour that suits best."""
     left = seen.log_radiance[:, channel] - gain[seen.view] - columns @ coefficients
     color = (seen.places @ (weight * left)) / np.maximum(seen.places @ weight, 1e-12)
@@ -208,8 +216,15 @@ def _polynomials(vectors: np.ndarray, degree: int) -> np.ndarray:
     """(E, L) polynomials of (E, 3) unit vectors that span all up to a degree, but for the constant one."""
     x, y, z = vectors.T
     # A square of z is 1 less the others.
-    return np.stack([x**(total - high - flat) * y**high * z**flat for total in range(1, degree + 1)
-                     for flat in range(2) for high in range(total - flat + 1)], axis=1)
+    return np.stack(
+        [
+            x ** (total - high - flat) * y**high * z**flat
+            for total in range(1, degree + 1)
+            for flat in range(2)
+            for high in range(total - flat + 1)
+        ],
+        axis=1,
+    )
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:

@@ -73,8 +73,16 @@ class Observations:
         return replace(self, **{name: getattr(self, name)[chosen] for name in arrays})
 
 
-def observe(mesh: tuple[np.ndarray, np.ndarray], views: PinholeViews, targets: list[Target], *, places: int,
-            cell: float, turns: np.ndarray | None = None, seed: int = 0) -> Observations:
+def observe(
+    mesh: tuple[np.ndarray, np.ndarray],
+    views: PinholeViews,
+    targets: list[Target],
+    *,
+    places: int,
+    cell: float,
+    turns: np.ndarray | None = None,
+    seed: int = 0,
+) -> Observations:
     """Looks at random vertices of a mesh from all views.
 
     A place is as large as a cell: over so many pixels targets are averaged, so that neither texture nor small
@@ -103,8 +111,14 @@ def observe(mesh: tuple[np.ndarray, np.ndarray], views: PinholeViews, targets: l
         cosine = (normals * outwards).sum(axis=1)
         size = views.sizes[view]
         column, row = np.floor(film * size[:, None]).astype(int)
-        seen = ((np.abs(cosine) > _GRAZING) & (depth > 0) & (column >= 0) & (column < size[0])
-                & (row >= 0) & (row < size[1]))
+        seen = (
+            (np.abs(cosine) > _GRAZING)
+            & (depth > 0)
+            & (column >= 0)
+            & (column < size[0])
+            & (row >= 0)
+            & (row < size[1])
+        )
         seen &= ~_hidden(scene, points + cell * outwards, outwards)
         index = np.flatnonzero(seen)
         if not len(index):
@@ -119,11 +133,20 @@ def observe(mesh: tuple[np.ndarray, np.ndarray], views: PinholeViews, targets: l
         directions = normal, 2 * np.abs(cosine[index])[:, None] * normal - toward, toward
         if turns is not None:
             directions = tuple(vectors @ turns[view] for vectors in directions)
-        found.append((2 * index + back, np.full(len(index), view), region[index],
-                      np.log(np.maximum(radiance, 1e-6)), (radiance / (radiance + floor)) ** 2, *directions))
+        found.append(
+            (
+                2 * index + back,
+                np.full(len(index), view),
+                region[index],
+                np.log(np.maximum(radiance, 1e-6)),
+                (radiance / (radiance + floor)) ** 2,
+                *directions,
+            )
+        )
     if not found:
-        return Observations(len(views), *(np.zeros(0, int) for _ in range(3)),
-                            *(np.zeros((0, 3)) for _ in range(5)))
+        return Observations(
+            len(views), *(np.zeros(0, int) for _ in range(3)), *(np.zeros((0, 3)) for _ in range(5))
+        )
     return Observations(len(views), *(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
 
 
@@ -161,6 +184,8 @@ def _averages(target: Target, side: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mean_radiance(targets: list[Target]) -> float:
-    color, coverage = (sum(float(target.rgba[..., part].sum(dtype=np.float64)) for target in targets)
-                       for part in (slice(3), 3))
+    color, coverage = (
+        sum(float(target.rgba[..., part].sum(dtype=np.float64)) for target in targets)
+        for part in (slice(3), 3)
+    )
     return color / max(3 * coverage, 1e-6)

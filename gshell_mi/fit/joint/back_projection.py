@@ -62,13 +62,19 @@ class FineMesh:
         """As a Mitsuba mesh with attributes that can be changed."""
         properties = mi.Properties()
         properties["bsdf"] = mi.load_dict(principled())
-        mesh = mi.Mesh("subject", len(self.vertices), len(self.faces), has_vertex_normals=True,
-                       props=properties)
-        for name, size, values in (("vertex_color", 3, self.color), ("vertex_roughness", 1, self.roughness),
-                                   ("vertex_metallic", 1, self.metallic)):
+        mesh = mi.Mesh(
+            "subject", len(self.vertices), len(self.faces), has_vertex_normals=True, props=properties
+        )
+        for name, size, values in (
+            ("vertex_color", 3, self.color),
+            ("vertex_roughness", 1, self.roughness),
+            ("vertex_metallic", 1, self.metallic),
+        ):
             mesh.add_attribute(name, size, np.ascontiguousarray(values, np.float32).ravel())
-        positions, normals = (mi.Float(np.ascontiguousarray(values, np.float32).ravel())
-                              for values in (self.vertices, self.normals))
+        positions, normals = (
+            mi.Float(np.ascontiguousarray(values, np.float32).ravel())
+            for values in (self.vertices, self.normals)
+        )
         write_mesh(mesh, positions, mi.UInt32(np.ascontiguousarray(self.faces, np.uint32).ravel()), normals)
         return mesh
 
@@ -86,9 +92,18 @@ class BackProjection:
         seed: of the paths.
     """
 
-    def __init__(self, mesh: FineMesh, objects: dict, sensors: list[mi.Sensor], views: PinholeViews,
-                 targets: list[Target], lights: list[mi.Transform4f], kept: Mapping[str, np.ndarray], *,
-                 seed: int = 0):
+    def __init__(
+        self,
+        mesh: FineMesh,
+        objects: dict,
+        sensors: list[mi.Sensor],
+        views: PinholeViews,
+        targets: list[Target],
+        lights: list[mi.Transform4f],
+        kept: Mapping[str, np.ndarray],
+        *,
+        seed: int = 0,
+    ):
         self._mesh, self._sensors, self._views, self._lights, self._seed = mesh, sensors, views, lights, seed
         self._targets = targets
         self._faces = mi.UInt32(np.ascontiguousarray(mesh.faces, np.uint32).ravel())
@@ -101,8 +116,10 @@ class BackProjection:
         count = len(mesh.vertices)
         self._logits = mi.Float(kept["logits"]) if kept else mi.Float(_logit(mesh.color).ravel())
         #: Over the pixels that see a vertex: of images and of renders, both over the images.
-        self._sums = {name: mi.Float(kept[name]) if kept else dr.zeros(mi.Float, 3 * count)
-                      for name in ("images", "renders")}
+        self._sums = {
+            name: mi.Float(kept[name]) if kept else dr.zeros(mi.Float, 3 * count)
+            for name in ("images", "renders")
+        }
         self._show()
 
     def state(self) -> dict[str, np.ndarray]:
@@ -133,10 +150,13 @@ class BackProjection:
         if self._lights:
             self._parameters["light.to_world"] = self._lights[view]
             self._parameters.update()
-        image = mi.render(self._scene, sensor=self._sensors[view], integrator=self._integrator, spp=_SPP,
-                          seed=seed % 2**32)
-        rendered, target = (dr.unravel(mi.Vector4f, values) for values in (
-            image.array, mi.Float(self._targets[view].rgba.ravel())))
+        image = mi.render(
+            self._scene, sensor=self._sensors[view], integrator=self._integrator, spp=_SPP, seed=seed % 2**32
+        )
+        rendered, target = (
+            dr.unravel(mi.Vector4f, values)
+            for values in (image.array, mi.Float(self._targets[view].rgba.ravel()))
+        )
         known = mi.Float(np.asarray(self._targets[view].known).ravel())
         covered = (rendered.w > COVERED) & (target.w > COVERED) & (known > COVERED)
         rendered, target = (mi.Color3f(rgba.x, rgba.y, rgba.z) for rgba in (rendered, target))
@@ -147,8 +167,10 @@ class BackProjection:
         # Highlights have less to say. The noise is in the render alone, so sums over the image have no bias.
         dark = dr.opaque(mi.Float, self._dark)
         scale = dr.rcp(dr.maximum(target, 0) + dark)
-        values = {"images": (target + dark) * scale,
-                  "renders": dr.minimum((rendered + dark) * scale, _OUTLIER)}
+        values = {
+            "images": (target + dark) * scale,
+            "renders": dr.minimum((rendered + dark) * scale, _OUTLIER),
+        }
         facing = dr.abs(dr.dot(normal, ray.d))
         uv = found.prim_uv
         for corner, share in enumerate((1 - uv.x - uv.y, uv.x, uv.y)):
@@ -162,8 +184,10 @@ class BackProjection:
     def _change(self, turn: int) -> None:
         """Ends a round. After two of them steps get smaller: noise averages out (Robbins and Monro 1951)."""
         vertex = dr.arange(mi.UInt32, len(self._mesh.vertices))
-        images, renders, color, logits = (dr.gather(mi.Color3f, values, vertex) for values in (
-            self._sums["images"], self._sums["renders"], sigmoid(self._logits), self._logits))
+        images, renders, color, logits = (
+            dr.gather(mi.Color3f, values, vertex)
+            for values in (self._sums["images"], self._sums["renders"], sigmoid(self._logits), self._logits)
+        )
         told = dr.log((images + _PRIOR) / (renders + _PRIOR))
         logits += told * dr.minimum(dr.rcp(1 - color), _STEEPEST) / dr.opaque(mi.Float, max(turn, 1))
         dr.scatter(self._logits, logits, vertex, mode=dr.ReduceMode.Permute)

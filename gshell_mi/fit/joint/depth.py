@@ -29,9 +29,11 @@ def check_depth(fit: FitScene, views: PinholeViews) -> None:
         known = target.depth[target.depth > 0]
         if not ((known >= low) & (known <= high)).any():
             path = target.path.with_suffix(".depth.exr")
-            raise UserError(f"Depth map '{path}' has distances from {known.min():.4g} to {known.max():.4g}, "
-                            f"but the box of '{fit.path}' is {low:.4g} to {high:.4g} away from that camera; "
-                            f"write distances in the scene's unit.")
+            raise UserError(
+                f"Depth map '{path}' has distances from {known.min():.4g} to {known.max():.4g}, "
+                f"but the box of '{fit.path}' is {low:.4g} to {high:.4g} away from that camera; "
+                f"write distances in the scene's unit."
+            )
 
 
 def depth_error(fit: FitScene, views: PinholeViews, scene: mi.Scene) -> float | None:

@@ -56,9 +56,16 @@ class JointStage:
         iterations: its steps; default: those of the joint stage.
     """
 
-    def __init__(self, fit: FitScene, material: MaterialField | GivenMaterial, light: EnvironmentLight | None,
-                 config: FitConfig, *, stage: JointConfig | None = None,
-                 iterations: int | None = None):
+    def __init__(
+        self,
+        fit: FitScene,
+        material: MaterialField | GivenMaterial,
+        light: EnvironmentLight | None,
+        config: FitConfig,
+        *,
+        stage: JointConfig | None = None,
+        iterations: int | None = None,
+    ):
         self.fit, self.material, self.light, self.config = fit, material, light, config
         self.stage = stage or config.joint
         self.iterations = config.iterations if iterations is None else iterations
@@ -73,30 +80,41 @@ class JointStage:
         #: Per view the share of each pixel that is known, None if that is all. The rest is black in images.
         known = [np.asarray(target.known)[..., None] for target in fit.targets]
         self._known = [None if share.all() else mi.TensorXf(share) for share in known]
-        self._targets = [mi.TensorXf(target.rgba if share.all() else target.rgba * share)
-                         for target, share in zip(fit.targets, known, strict=True)]
+        self._targets = [
+            mi.TensorXf(target.rgba if share.all() else target.rgba * share)
+            for target, share in zip(fit.targets, known, strict=True)
+        ]
         self._sees_masks = all(target.has_alpha for target in fit.targets) and not config.geometry_only
         if config.geometry_only:
             self.subject.shade_flat()
-        self.integrator = mi.load_dict({"type": "gshell_path", "max_depth": config.render.max_depth,
-                                        "gradient_depth": config.render.gradient_depth,
-                                        "reparam_depth": config.render.reparam_depth, "hide_emitters": True})
+        self.integrator = mi.load_dict(
+            {
+                "type": "gshell_path",
+                "max_depth": config.render.max_depth,
+                "gradient_depth": config.render.gradient_depth,
+                "reparam_depth": config.render.reparam_depth,
+                "hide_emitters": True,
+            }
+        )
         resting = {"msdf"} if config.watertight else set()
         if not parametrisation_named(config.model.field).moves_weights:
             resting.add("weights")
         moving = [name for name in self.subject.field_names if name not in resting]
         start = {name: self.parameters[f"subject.{name}"] for name in moving}
         stage = self.stage
-        rules = StepRules(stage.geometry_lr, stage.msdf_lr, stage.deform_lr, stage.geometry_smoothing,
-                          stage.geometry_detail)
-        self.geometry = make_parametrisation(config.model.field, start, self.subject.lattice, rules,
-                                             seed=config.seed)
+        rules = StepRules(
+            stage.geometry_lr, stage.msdf_lr, stage.deform_lr, stage.geometry_smoothing, stage.geometry_detail
+        )
+        self.geometry = make_parametrisation(
+            config.model.field, start, self.subject.lattice, rules, seed=config.seed
+        )
         #: The lattice fields of the present step, with gradients enabled; none before the geometry moves.
         self.fields: dict[str, mi.Float] = {}
         self.material_optimizer = mi.ad.Adam(lr=stage.material_lr, params=material.parameters)
         # What a mean over all pixels says of one texel may be smaller than the epsilon that is usual.
-        self.light_optimizer = TemperedAdam(lr=stage.light_lr, epsilon=1e-12,
-                                            params={"log_radiance": light.log_radiance} if light else None)
+        self.light_optimizer = TemperedAdam(
+            lr=stage.light_lr, epsilon=1e-12, params={"log_radiance": light.log_radiance} if light else None
+        )
         sought = material if material.parameters else None
         self._regularisers = Regularisers(StepView(fit, self.scene, sought, light), config.losses)
 
@@ -151,11 +169,20 @@ class JointStage:
             self._step_material(progress, diffuse)
             self._step_light(progress)
         self._follow_surface(rescan=(iteration + 1) % _RESCAN == 0)
-        error = mi.Float(sum(mean(dr.square(dr.detach(image)[..., :3] - self._targets[view][..., :3]))
-                             for view, image in zip(views, images, strict=True)) / len(views))
-        return {"loss": total[0], "image": color[0], "mask": mask[0],
-                **{name: value[0] for name, value in terms.items()},
-                "psnr": decibels(error[0])}
+        error = mi.Float(
+            sum(
+                mean(dr.square(dr.detach(image)[..., :3] - self._targets[view][..., :3]))
+                for view, image in zip(views, images, strict=True)
+            )
+            / len(views)
+        )
+        return {
+            "loss": total[0],
+            "image": color[0],
+            "mask": mask[0],
+            **{name: value[0] for name, value in terms.items()},
+            "psnr": decibels(error[0]),
+        }
 
     def seed(self, iteration: int, turn: int = 0) -> int:
         """Of the samples of a step's view; the next number is that of its gradient's."""
@@ -166,8 +193,9 @@ class JointStage:
         """Leaves the last step's parameters in the scene, without what noise has cut out or left floating."""
         self.apply(geometry=True)
         subject = self.subject
-        self.parameters["subject.msdf"] = without_specks(subject.msdf, subject.template(), subject.lattice,
-                                                         self.config.topology.min_area)
+        self.parameters["subject.msdf"] = without_specks(
+            subject.msdf, subject.template(), subject.lattice, self.config.topology.min_area
+        )
         self.parameters.update()
 
     def moved_fields(self) -> LatticeFields:
@@ -203,9 +231,16 @@ class JointStage:
             self.parameters["light.to_world"] = self.light.turned(self._turns[view])
             self.parameters.update()
         with phase("render") as compute:
-            image = mi.render(self.scene, self.parameters, sensor=self.fit.sensors[view],
-                              integrator=self.integrator, spp=config.primal_spp, spp_grad=config.spp,
-                              seed=seed, seed_grad=seed + 1)
+            image = mi.render(
+                self.scene,
+                self.parameters,
+                sensor=self.fit.sensors[view],
+                integrator=self.integrator,
+                spp=config.primal_spp,
+                spp_grad=config.spp,
+                seed=seed,
+                seed_grad=seed + 1,
+            )
             if (known := self._known[view]) is not None:
                 image = image * known
             compute(image)
@@ -234,8 +269,10 @@ class JointStage:
             self.light.update(self.parameters)
         self.parameters.update()
         if self.subject.surface.is_empty:
-            raise UserError("The joint stage has left no surface; start again with --overwrite and a smaller "
-                            "--joint.geometry-lr.")
+            raise UserError(
+                "The joint stage has left no surface; start again with --overwrite and a smaller "
+                "--joint.geometry-lr."
+            )
 
     def _follow_surface(self, *, rescan: bool) -> None:
         """Moves the blocks that the fields are stored in, and all that is stored with them."""
@@ -252,8 +289,9 @@ class JointStage:
             return
         # One derivative that is no number would spread over all others, and stay in the optimiser for good.
         gradients = {name: finite(dr.grad(optimizer[name])) for name in optimizer.keys()}
-        gradients |= diffuse.together({name: gradients[name] for name in self.material.on_lattice},
-                                      config.material_smoothing)
+        gradients |= diffuse.together(
+            {name: gradients[name] for name in self.material.on_lattice}, config.material_smoothing
+        )
         for name, gradient in gradients.items():
             dr.set_grad(optimizer[name], gradient)
         rates = dict.fromkeys(optimizer.keys(), decay_at(progress) * config.material_lr)

@@ -52,9 +52,11 @@ _TERMS: dict[str, Term] = {}
 
 def register_loss(name: str, *, per_view: bool = False, needs: str = "") -> Callable:
     """Lets ``--losses.extra`` know the decorated function, as ``name``; the rest as of ``Term``."""
+
     def register(loss: Callable[[StepView], mi.Float]) -> Callable[[StepView], mi.Float]:
         _TERMS[name] = Term(loss, per_view, needs)
         return loss
+
     return register
 
 
@@ -89,8 +91,13 @@ class StepView:
         view: index of a view of the step.
     """
 
-    def __init__(self, fit: FitScene, scene: mi.Scene, material: MaterialField | GivenMaterial | None,
-                 light: EnvironmentLight | None):
+    def __init__(
+        self,
+        fit: FitScene,
+        scene: mi.Scene,
+        material: MaterialField | GivenMaterial | None,
+        light: EnvironmentLight | None,
+    ):
         self.fit, self.scene, self.material, self.light = fit, scene, material, light
         self.subject, self.view = fit.subject, 0
         self.depths = any(target.depth is not None for target in fit.targets)
@@ -162,8 +169,11 @@ class Regularisers:
         check_losses(config)
         self._step = step
         weights = vars(config) | config.extra
-        self._terms = {name: (weights[name], term) for name, term in _TERMS.items()
-                       if weights.get(name, 0) > 0 and (not term.needs or getattr(step, term.needs))}
+        self._terms = {
+            name: (weights[name], term)
+            for name, term in _TERMS.items()
+            if weights.get(name, 0) > 0 and (not term.needs or getattr(step, term.needs))
+        }
 
     def __call__(self, views: Sequence[int]) -> tuple[mi.Float, dict[str, mi.Float]]:
         """The weighted sum, and every loss of its own, for a step on the views with these indices."""

@@ -118,8 +118,11 @@ class Alignment:
         # What a camera turns away from goes round the other way in its image.
         moves = [-np.cross(axis, offsets) for axis in np.eye(3)]
         moves += [np.broadcast_to(-self._distance * axis, offsets.shape) for axis in np.eye(3)]
-        flow = [(projected(offsets + _STEP * move, views, view)
-                 - projected(offsets - _STEP * move, views, view)) / (2 * _STEP) for move in moves]
+        flow = [
+            (projected(offsets + _STEP * move, views, view) - projected(offsets - _STEP * move, views, view))
+            / (2 * _STEP)
+            for move in moves
+        ]
         return np.stack([(evidence.slopes * each).sum(axis=1) for each in flow], axis=1)
 
     def _normal(self, evidence: Sequence[Evidence], views: PinholeViews) -> _Normal:
@@ -147,8 +150,10 @@ class Alignment:
         covariance = normal.variance * np.einsum("nhij,nhjk,nhkl->nil", inverse, normal.matrix, inverse)
         told = [view for view, matrix in enumerate(covariance) if matrix.any()]
         apart = halves[told, 0] - halves[told, 1]
-        squares = [difference @ np.linalg.pinv(covariance[view], rcond=1e-6, hermitian=True) @ difference
-                   for view, difference in zip(told, apart, strict=True)]
+        squares = [
+            difference @ np.linalg.pinv(covariance[view], rcond=1e-6, hermitian=True) @ difference
+            for view, difference in zip(told, apart, strict=True)
+        ]
         self._noise[kind] = max(float(np.median(squares)) / _CHI2_MEDIAN, 1.0) if squares else 1.0
         return self._noise[kind]
 

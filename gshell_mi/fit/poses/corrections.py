@@ -67,10 +67,13 @@ class Corrections:
             views: as given.
             points: of the surface, world units.
         """
-        before, after = ([projected(points - each.origins[view], each, view) for view in range(len(each))]
-                         for each in (views, self.views(views)))
-        return np.array([np.linalg.norm(there - here, axis=1).mean()
-                         for here, there in zip(before, after, strict=True)])
+        before, after = (
+            [projected(points - each.origins[view], each, view) for view in range(len(each))]
+            for each in (views, self.views(views))
+        )
+        return np.array(
+            [np.linalg.norm(there - here, axis=1).mean() for here, there in zip(before, after, strict=True)]
+        )
 
 
 def projected(offsets: np.ndarray, views: PinholeViews, view: int) -> np.ndarray:
@@ -85,8 +88,15 @@ def _moved(sensor: mi.Sensor, turn: np.ndarray, shift: np.ndarray) -> mi.Sensor:
     to_world = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     to_world[:3, :3] = turn @ to_world[:3, :3]
     to_world[:3, 3] += shift
-    return mi.load_dict({
-        "type": kind, "id": sensor.id(),
-        "fov": float(parameters["x_fov"][0]), "fov_axis": "x", "to_world": mi.ScalarTransform4f(to_world),
-        **{name: float(np.ravel(parameters[name])[0]) for name in OPTICS[kind]},
-        "film": sensor.film(), "sampler": sensor.sampler()})
+    return mi.load_dict(
+        {
+            "type": kind,
+            "id": sensor.id(),
+            "fov": float(parameters["x_fov"][0]),
+            "fov_axis": "x",
+            "to_world": mi.ScalarTransform4f(to_world),
+            **{name: float(np.ravel(parameters[name])[0]) for name in OPTICS[kind]},
+            "film": sensor.film(),
+            "sampler": sensor.sampler(),
+        }
+    )

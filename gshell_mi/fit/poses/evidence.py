@@ -70,16 +70,20 @@ class Texture:
         points: (K, 3) the places.
     """
 
-    def __init__(self, mesh: tuple[np.ndarray, np.ndarray], targets: list[Target], count: int, cell: float,
-                 seed: int):
+    def __init__(
+        self, mesh: tuple[np.ndarray, np.ndarray], targets: list[Target], count: int, cell: float, seed: int
+    ):
         vertices, faces = mesh
         surface = trimesh.Trimesh(vertices, faces, process=False)
         self.points, face = trimesh.sample.sample_surface(surface, count, seed=seed)[:2]
         weights = trimesh.triangles.points_to_barycentric(surface.triangles[face], self.points)
         self._normals = unit(np.einsum("ij,ijk->ik", weights, surface.vertex_normals[faces[face]]))
         self._scene, self._cell, self._targets = mesh_scene(vertices, faces), cell, targets
-        means = [float(target.rgba[..., :3][target.rgba[..., 3] > COVERED].mean()) for target in targets
-                 if (target.rgba[..., 3] > COVERED).any()]
+        means = [
+            float(target.rgba[..., :3][target.rgba[..., 3] > COVERED].mean())
+            for target in targets
+            if (target.rgba[..., 3] > COVERED).any()
+        ]
         self._dark = _DARK * float(np.mean(means or [1.0]))
 
     def level(self, blur: float, views: PinholeViews) -> Callable[[PinholeViews], list[Evidence]]:
@@ -105,14 +109,19 @@ class Texture:
         points = self.points
         toward = unit(views.origins[view] - points)
         cosine = (self._normals * toward).sum(axis=1)
-        point, direction = (np.ascontiguousarray(array.T, np.float32)
-                            for array in (points + self._cell * toward, toward))
+        point, direction = (
+            np.ascontiguousarray(array.T, np.float32) for array in (points + self._cell * toward, toward)
+        )
         hidden = np.array(self._scene.ray_test(mi.Ray3f(mi.Point3f(point), mi.Vector3f(direction))))
         index = np.flatnonzero(~hidden & (np.abs(cosine) > _GRAZING))
         return index, 2 * index + (cosine[index] < 0), np.abs(cosine[index])
 
-    def _evidence(self, images: list[np.ndarray], seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
-                  views: PinholeViews) -> list[Evidence]:
+    def _evidence(
+        self,
+        images: list[np.ndarray],
+        seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+        views: PinholeViews,
+    ) -> list[Evidence]:
         places, found = 2 * len(self.points), []
         total, weight, number = (np.zeros(places) for _ in range(3))
         for view, (image, (index, place, cosine)) in enumerate(zip(images, seen, strict=True)):
@@ -122,7 +131,8 @@ class Texture:
             slope = _slopes(image, pixel)
             good = np.isfinite(value) & np.isfinite(slope).all(axis=1)
             offset, pixel, value, slope, place, cosine = (
-                array[good] for array in (offset, pixel, value, slope, place, cosine))
+                array[good] for array in (offset, pixel, value, slope, place, cosine)
+            )
             total += np.bincount(place, cosine * value, places)
             weight += np.bincount(place, cosine, places)
             number += np.bincount(place, minlength=places)
@@ -131,7 +141,8 @@ class Texture:
         for offset, pixel, value, slope, place, cosine in found:
             good = number[place] >= _VIEWS
             offset, pixel, value, slope, place, cosine = (
-                array[good] for array in (offset, pixel, value, slope, place, cosine))
+                array[good] for array in (offset, pixel, value, slope, place, cosine)
+            )
             others = (total[place] - cosine * value) / (weight[place] - cosine)
             result.append(Evidence(offset, pixel, slope, value - others, cosine))
         return result
@@ -155,8 +166,10 @@ class Outline:
         # A surface that is a little too thick everywhere says nothing of cameras.
         everything = np.concatenate([each.residuals for each in found])
         thick = float(np.median(everything)) if len(everything) else 0.0
-        return [Evidence(each.offsets, each.pixels, each.slopes, each.residuals - thick, each.weights)
-                for each in found]
+        return [
+            Evidence(each.offsets, each.pixels, each.slopes, each.residuals - thick, each.weights)
+            for each in found
+        ]
 
     def _of_view(self, views: PinholeViews, view: int) -> Evidence:
         width, height = (int(side) for side in views.sizes[view])
@@ -184,8 +197,13 @@ def _sampled(image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
 
 def _slopes(image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     """(K, 2) derivatives at (K, 2) pixels, per pixel."""
-    return np.stack([_sampled(image, pixel + step) - _sampled(image, pixel - step)
-                     for step in (np.array([0.5, 0]), np.array([0, 0.5]))], axis=1)
+    return np.stack(
+        [
+            _sampled(image, pixel + step) - _sampled(image, pixel - step)
+            for step in (np.array([0.5, 0]), np.array([0, 0.5]))
+        ],
+        axis=1,
+    )
 
 
 def _framed(shape: tuple[int, ...]) -> np.ndarray:

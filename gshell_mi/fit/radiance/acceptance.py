@@ -46,8 +46,9 @@ def close_shallow(logits: np.ndarray, faces: np.ndarray, thin: np.ndarray) -> np
     return np.where(opened & shallow[patch], -logits, logits)
 
 
-def close_rejected(logits: np.ndarray, template: Shown, judge: Judge, before: Part,
-                   given: np.ndarray | None = None) -> np.ndarray:
+def close_rejected(
+    logits: np.ndarray, template: Shown, judge: Judge, before: Part, given: np.ndarray | None = None
+) -> np.ndarray:
     """Closes the openings through which unseen views are not explained better than without them.
 
     A hull that bulges over a fold, or a highlight, makes the views disagree on a vertex's radiance as a
@@ -124,8 +125,10 @@ def open_rejected(logits: np.ndarray, template: Shown, judge: Judge) -> np.ndarr
     if not island.any():
         return logits
     place = places_of(island, patch)
-    without, present = (template.part(np.where(chosen, np.abs(logits), -np.abs(logits)))
-                        for chosen in (solid & ~island, solid))
+    without, present = (
+        template.part(np.where(chosen, np.abs(logits), -np.abs(logits)))
+        for chosen in (solid & ~island, solid)
+    )
     accepted = judge.compare(without, present, place).accepted
     return np.where(island & ~accepted[place], -logits, logits)
 

@@ -32,8 +32,9 @@ def joined_lanes(several: list[Any]) -> Any:
     """
     first = several[0]
     if is_dataclass(first):
-        return type(first)(*(joined_lanes([getattr(each, entry.name) for each in several])
-                             for entry in fields(first)))
+        return type(first)(
+            *(joined_lanes([getattr(each, entry.name) for each in several]) for entry in fields(first))
+        )
     if isinstance(first, list):
         return [joined_lanes(list(same)) for same in zip(*several, strict=True)]
     if dr.depth_v(first) > 1:

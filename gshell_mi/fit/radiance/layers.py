@@ -32,16 +32,25 @@ class Sheet:
 
     def interpolate(self, values: mi.Float) -> mi.Float:
         """One value per vertex at the hits."""
-        return sum(weight * dr.gather(mi.Float, values, corner)
-                   for weight, corner in zip(self.weights, self.face, strict=True))
+        return sum(
+            weight * dr.gather(mi.Float, values, corner)
+            for weight, corner in zip(self.weights, self.face, strict=True)
+        )
 
     def side(self, corner: mi.UInt32) -> mi.UInt32:
         """Of a corner, the place of the side that is seen among values (V, 2): front, then back."""
         return 2 * corner + dr.select(self.front, mi.UInt32(0), mi.UInt32(1))
 
 
-def trace_layers(scene: mi.Scene, positions: mi.Float, faces: mi.Vector3u, ray: mi.Ray3f, count: int,
-                 offset: float, goes_on: Callable[[Sheet], mi.Bool] | None = None) -> list[Sheet]:
+def trace_layers(
+    scene: mi.Scene,
+    positions: mi.Float,
+    faces: mi.Vector3u,
+    ray: mi.Ray3f,
+    count: int,
+    offset: float,
+    goes_on: Callable[[Sheet], mi.Bool] | None = None,
+) -> list[Sheet]:
     """The first sheets along each ray.
 
     Only the rays that go on are traced any further, and only hits have lanes: of a closed template every ray

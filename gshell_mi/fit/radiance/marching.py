@@ -81,8 +81,15 @@ class Adjoint:
     distortion: mi.Float
 
 
-def composite(bricks: Bricks, packets: mi.Float, rays: Rays, seed: int, *, adjoint: Adjoint | None = None,
-              greatest: mi.Float | None = None) -> Seen | mi.Float:
+def composite(
+    bricks: Bricks,
+    packets: mi.Float,
+    rays: Rays,
+    seed: int,
+    *,
+    adjoint: Adjoint | None = None,
+    greatest: mi.Float | None = None,
+) -> Seen | mi.Float:
     """Composites a volume along rays by stochastic filtering.
 
     Args:
@@ -116,18 +123,22 @@ def composite(bricks: Bricks, packets: mi.Float, rays: Rays, seed: int, *, adjoi
         total += weight * color
         # Distances in lengths of the cube.
         at, length = 0.5 * t, _STEP * 0.5 * cell
-        slope_of_spread = (2 * (at * (2 * spread.x + weight) - 2 * spread.y - weight * at)
-                           + 2 / 3 * weight * length)
-        spread += mi.Vector3f(weight, weight * at,
-                              2 * weight * (at * spread.x - spread.y) + weight * weight * length / 3)
+        slope_of_spread = (
+            2 * (at * (2 * spread.x + weight) - 2 * spread.y - weight * at) + 2 / 3 * weight * length
+        )
+        spread += mi.Vector3f(
+            weight, weight * at, 2 * weight * (at * spread.x - spread.y) + weight * weight * length / 3
+        )
         if greatest is not None:
             dr.scatter_reduce(dr.ReduceOp.Max, greatest, weight, voxel, here)
         if adjoint:
             slope_of_spread += 2 * (adjoint.spread.y - at * adjoint.spread.x)
             before += weight * slope_of_spread
-            behind = (dr.dot(adjoint.radiance - total, adjoint.by_radiance)
-                      + adjoint.transmittance * adjoint.by_transmittance
-                      + adjoint.distortion * (2 * adjoint.spread.z - before))
+            behind = (
+                dr.dot(adjoint.radiance - total, adjoint.by_radiance)
+                + adjoint.transmittance * adjoint.by_transmittance
+                + adjoint.distortion * (2 * adjoint.spread.z - before)
+            )
             by_weight = dr.dot(color, adjoint.by_radiance) + adjoint.distortion * slope_of_spread
             share = dr.select(lit, mi.Float(1), _SPOKEN)
             spoken = here & (lit | ((bits & (_SPOKEN - 1)) == 0))
@@ -137,19 +148,31 @@ def composite(bricks: Bricks, packets: mi.Float, rays: Rays, seed: int, *, adjoi
             dr.scatter_reduce(dr.ReduceOp.Add, gradient, packet, width * voxel, spoken)
             for axis in range(width - 1):
                 along = rays.direction[axis] * by_color
-                dr.scatter_reduce(dr.ReduceOp.Add, gradient, mi.Vector4f(along.x, along.y, along.z, 0),
-                                  width * voxel + (axis + 1), lit)
-        step = dr.select(voxel < 0, dr.maximum(lookup.way_out(position, inverse, -voxel), _STEP * cell),
-                         _STEP * cell)
+                dr.scatter_reduce(
+                    dr.ReduceOp.Add,
+                    gradient,
+                    mi.Vector4f(along.x, along.y, along.z, 0),
+                    width * voxel + (axis + 1),
+                    lit,
+                )
+        step = dr.select(
+            voxel < 0, dr.maximum(lookup.way_out(position, inverse, -voxel), _STEP * cell), _STEP * cell
+        )
         transmittance = dr.select(active, remaining, transmittance)
         t += step
         active &= (t < rays.last) & (transmittance > _DARK)
         return t, transmittance, total, spread, before, active, random
 
     count = dr.width(rays.first)
-    state = (mi.Float(rays.first), dr.full(mi.Float, 1, count), dr.zeros(mi.Color3f, count),
-             dr.zeros(mi.Vector3f, count), dr.zeros(mi.Float, count), rays.first < rays.last,
-             mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed)))
+    state = (
+        mi.Float(rays.first),
+        dr.full(mi.Float, 1, count),
+        dr.zeros(mi.Color3f, count),
+        dr.zeros(mi.Vector3f, count),
+        dr.zeros(mi.Float, count),
+        rays.first < rays.last,
+        mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed)),
+    )
     _, transmittance, total, spread, *_ = dr.while_loop(state, lambda *values: values[5], body)
     return Seen(total, transmittance, spread) if gradient is None else gradient
 
@@ -173,14 +196,19 @@ def depth_along(bricks: Bricks, packets: mi.Float, rays: Rays) -> mi.Float:
         halfway = dr.select(crosses, t + (part - 0.5) * _STEP * cell, halfway)
         empty = _distance_to_brick(lookup, position, active)
         # A voxel beyond the border may still be one of the eight.
-        step = dr.select(empty > 1, dr.maximum(lookup.way_out(position, inverse, empty - 1), _STEP * cell),
-                         _STEP * cell)
+        step = dr.select(
+            empty > 1, dr.maximum(lookup.way_out(position, inverse, empty - 1), _STEP * cell), _STEP * cell
+        )
         t += step
         return t, remaining, halfway, active & ~crosses & (t < rays.last)
 
     count = dr.width(rays.first)
-    state = (mi.Float(rays.first), dr.full(mi.Float, 1, count), dr.full(mi.Float, dr.inf, count),
-             rays.first < rays.last)
+    state = (
+        mi.Float(rays.first),
+        dr.full(mi.Float, 1, count),
+        dr.full(mi.Float, dr.inf, count),
+        rays.first < rays.last,
+    )
     return dr.while_loop(state, lambda *values: values[3], body)[2]
 
 

@@ -72,8 +72,9 @@ class Mirrored:
         for direction, radiance, color in samples:
             basis = np.stack([value.numpy() for value in _harmonics(direction)])
             explained = (color * self.factor(direction)).numpy()
-            for channel, (seen, own, now) in enumerate(zip(radiance.numpy(), color.numpy(), explained,
-                                                           strict=True)):
+            for channel, (seen, own, now) in enumerate(
+                zip(radiance.numpy(), color.numpy(), explained, strict=True)
+            ):
                 scale = 1 / np.maximum(own, max(_DARK * own.mean(), 1e-9))
                 slope = basis * (own * scale)
                 left[channel] += slope @ slope.T

@@ -69,19 +69,32 @@ class Met:
 
     def interpolate(self, colors: mi.Float) -> mi.Color3f:
         """Colours of the sides of vertices at the hits."""
-        return sum((weight * dr.gather(mi.Color3f, colors, vertex, self.hit)
-                    for vertex, weight in zip(self.vertices, self.weights, strict=True)), mi.Color3f(0))
+        return sum(
+            (
+                weight * dr.gather(mi.Color3f, colors, vertex, self.hit)
+                for vertex, weight in zip(self.vertices, self.weights, strict=True)
+            ),
+            mi.Color3f(0),
+        )
 
     def values_at(self, values: mi.Float) -> mi.Float:
         """One value per vertex, whichever its side, at the hits."""
-        return sum((weight * dr.gather(mi.Float, values, vertex >> 1, self.hit)
-                    for vertex, weight in zip(self.vertices, self.weights, strict=True)), mi.Float(0))
+        return sum(
+            (
+                weight * dr.gather(mi.Float, values, vertex >> 1, self.hit)
+                for vertex, weight in zip(self.vertices, self.weights, strict=True)
+            ),
+            mi.Float(0),
+        )
 
     def at(self, lane: mi.UInt32) -> Met:
         """The same on some lanes."""
-        return Met([dr.gather(mi.UInt32, vertex, lane) for vertex in self.vertices],
-                   [dr.gather(mi.Float, weight, lane) for weight in self.weights],
-                   dr.gather(mi.Vector3f, self.mirrored, lane), dr.gather(mi.Bool, self.hit, lane))
+        return Met(
+            [dr.gather(mi.UInt32, vertex, lane) for vertex in self.vertices],
+            [dr.gather(mi.Float, weight, lane) for weight in self.weights],
+            dr.gather(mi.Vector3f, self.mirrored, lane),
+            dr.gather(mi.Bool, self.hit, lane),
+        )
 
 
 @dataclass(frozen=True)
@@ -113,8 +126,16 @@ class Shown:
         like: mirrors the same, as another part of the same surface does; default: that is found, too.
     """
 
-    def __init__(self, mesh: Mesh, views: PinholeViews, pools: list[tuple[PixelPool, PixelPool]], *,
-                 batch: int, seed: int, like: Shown | None = None):
+    def __init__(
+        self,
+        mesh: Mesh,
+        views: PinholeViews,
+        pools: list[tuple[PixelPool, PixelPool]],
+        *,
+        batch: int,
+        seed: int,
+        like: Shown | None = None,
+    ):
         self.mesh, self.views, self._pools, self._like = mesh, views, pools, like
         self._batch, self._seed = batch, seed
         vertices, faces = mesh if len(mesh[1]) else _NOTHING
@@ -162,8 +183,10 @@ class Shown:
         with dr.suspend_grad():
             telling = self.__dict__.get("_telling") or self._told()
             mirrors = self._like.mirrors if self._like else [self._mirrored_by(rays) for rays in telling]
-            return mirrors, [self._mean_colors([(rays.met, rays.pixel.radiance)], mirrored)
-                             for rays, mirrored in zip(telling, mirrors, strict=True)]
+            return mirrors, [
+                self._mean_colors([(rays.met, rays.pixel.radiance)], mirrored)
+                for rays, mirrored in zip(telling, mirrors, strict=True)
+            ]
 
     @cached_property
     def judging(self) -> list[FirstHits]:
@@ -174,13 +197,24 @@ class Shown:
         """What the interpolated values (V,) are positive on."""
         field = mi.Float(np.ascontiguousarray(values, np.float32))
         with dr.suspend_grad():
-            return Part(self, field, [
-                self._mean_colors([(met, dr.gather(mi.Color3f, rays.pixel.radiance, lane))
-                                   for lane, met in self.hits(rays.pixel, field, rays.met)], mirrored)
-                for rays, mirrored in zip(self._telling, self.mirrors, strict=True)])
+            return Part(
+                self,
+                field,
+                [
+                    self._mean_colors(
+                        [
+                            (met, dr.gather(mi.Color3f, rays.pixel.radiance, lane))
+                            for lane, met in self.hits(rays.pixel, field, rays.met)
+                        ],
+                        mirrored,
+                    )
+                    for rays, mirrored in zip(self._telling, self.mirrors, strict=True)
+                ],
+            )
 
-    def hits(self, pixel: PixelSample, values: mi.Float | None,
-             first: Met | None = None) -> Iterator[tuple[mi.UInt32, Met]]:
+    def hits(
+        self, pixel: PixelSample, values: mi.Float | None, first: Met | None = None
+    ) -> Iterator[tuple[mi.UInt32, Met]]:
         """Where the rays of pixels meet a part; their lanes, each once or not at all.
 
         Args:
@@ -216,8 +250,9 @@ class Shown:
         some = rays.at(dr.arange(mi.UInt32, count))
         for _ in range(_ROUNDS):
             colors = self._mean_colors([(rays.met, rays.pixel.radiance)], mirrored)
-            mirrored = mirrored.improved([(some.met.mirrored, some.pixel.radiance,
-                                           some.met.interpolate(colors))])
+            mirrored = mirrored.improved(
+                [(some.met.mirrored, some.pixel.radiance, some.met.interpolate(colors))]
+            )
         return mirrored
 
     def _first_hits(self, pixels: PixelPool, batches: int, *, covered: bool = False) -> FirstHits:
@@ -244,8 +279,13 @@ class Shown:
                     dr.scatter_reduce(dr.ReduceOp.Add, total, weight * value, vertex, met.hit)
             dr.eval(sums)
         side = 2 * dr.arange(mi.UInt32, count)
-        diffused = self._smooth.together({f"{back} {channel}": dr.gather(mi.Float, total, side + back)
-                                          for back in range(2) for channel, total in enumerate(sums)})
+        diffused = self._smooth.together(
+            {
+                f"{back} {channel}": dr.gather(mi.Float, total, side + back)
+                for back in range(2)
+                for channel, total in enumerate(sums)
+            }
+        )
         colors = dr.zeros(mi.Float, 6 * count)
         for back in range(2):
             *color, weight = (dr.maximum(diffused[f"{back} {channel}"], 0) for channel in range(4))
@@ -260,15 +300,30 @@ class Shown:
         ray = self.views.rays(pixel.view, pixel.film)
         if values is None:
             return trace_layers(self._scene, self._positions, self._faces, ray, 1, self._offset)
-        return trace_layers(self._scene, self._positions, self._faces, ray, _SHEETS, self._offset,
-                            lambda sheet: sheet.interpolate(values) <= 0)
+        return trace_layers(
+            self._scene,
+            self._positions,
+            self._faces,
+            ray,
+            _SHEETS,
+            self._offset,
+            lambda sheet: sheet.interpolate(values) <= 0,
+        )
 
     def _met(self, sheet: Sheet) -> Met:
-        normal = sum((weight * dr.gather(mi.Vector3f, self._normals, corner)
-                      for weight, corner in zip(sheet.weights, sheet.face, strict=True)), mi.Vector3f(0))
-        return Met([sheet.side(corner) for corner in sheet.face], list(sheet.weights),
-                   mirrored_direction(dr.normalize(sheet.direction), normal),
-                   dr.full(mi.Bool, True, dr.width(sheet.lane)))
+        normal = sum(
+            (
+                weight * dr.gather(mi.Vector3f, self._normals, corner)
+                for weight, corner in zip(sheet.weights, sheet.face, strict=True)
+            ),
+            mi.Vector3f(0),
+        )
+        return Met(
+            [sheet.side(corner) for corner in sheet.face],
+            list(sheet.weights),
+            mirrored_direction(dr.normalize(sheet.direction), normal),
+            dr.full(mi.Bool, True, dr.width(sheet.lane)),
+        )
 
 
 @dataclass(frozen=True)

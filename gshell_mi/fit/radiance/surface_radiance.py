@@ -81,8 +81,17 @@ class SurfaceRadiance:
         mirrored: known factor of the radiance; without one it does not depend on the direction.
     """
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: PinholeViews, pixels: PixelPool,
-                 config: RadianceConfig, *, seed: int = 0, mirrored: Mirrored | None = None):
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        views: PinholeViews,
+        pixels: PixelPool,
+        config: RadianceConfig,
+        *,
+        seed: int = 0,
+        mirrored: Mirrored | None = None,
+    ):
         self.views, self.pixels, self.config, self._mirrored = views, pixels, config, mirrored
         self.seed = seed
         self.vertex_count = len(vertices)
@@ -207,8 +216,10 @@ class SurfaceRadiance:
     def sides(self) -> tuple[mi.Color3f, mi.Color3f]:
         """Of every vertex, what the softplus makes radiance of: front and back."""
         vertex = dr.arange(mi.UInt32, self.vertex_count)
-        return tuple(dr.gather(mi.Color3f, self.optimizer["radiance"], 2 * vertex + side,
-                               mode=dr.ReduceMode.Permute) for side in range(2))
+        return tuple(
+            dr.gather(mi.Color3f, self.optimizer["radiance"], 2 * vertex + side, mode=dr.ReduceMode.Permute)
+            for side in range(2)
+        )
 
     def _sheets(self, ray: mi.Ray3f) -> list[Sheet]:
         """The first sheets along each ray.
@@ -225,8 +236,15 @@ class SurfaceRadiance:
             dr.eval(transmittance)
             return transmittance > _NEGLIGIBLE
 
-        return trace_layers(self.scene, self._positions, self._faces, ray, self.config.layers,
-                            self._offset, goes_on if self._opacity_rests else None)
+        return trace_layers(
+            self.scene,
+            self._positions,
+            self._faces,
+            ray,
+            self.config.layers,
+            self._offset,
+            goes_on if self._opacity_rests else None,
+        )
 
     def composite(self, sheets: list[Sheet], count: int) -> tuple[mi.Color3f, mi.Float]:
         """Compositing (Porter and Duff 1984, *over*) of radiance and coverage.

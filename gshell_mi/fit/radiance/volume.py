@@ -73,16 +73,26 @@ class RadianceVolume:
         seed: of the random pixels.
     """
 
-    def __init__(self, hull: np.ndarray, to_world: mi.ScalarTransform4f, views: PinholeViews,
-                 pixels: PixelPool, config: VolumeConfig, surface: tuple[np.ndarray, np.ndarray],
-                 stored: Mapping[str, np.ndarray] | None = None, *, seed: int = 0):
+    def __init__(
+        self,
+        hull: np.ndarray,
+        to_world: mi.ScalarTransform4f,
+        views: PinholeViews,
+        pixels: PixelPool,
+        config: VolumeConfig,
+        surface: tuple[np.ndarray, np.ndarray],
+        stored: Mapping[str, np.ndarray] | None = None,
+        *,
+        seed: int = 0,
+    ):
         self.seed = seed
         self.views, self.pixels, self.config, self.surface = views, pixels, config, surface
         self.to_lattice = mi.Transform4f(to_world).inverse()
         self.mean_radiance = pixels.mean_radiance()
         self._tone = Contrast(self.mean_radiance)
-        self._hull = mi.Texture3f(mi.TensorXf(hull[..., None].astype(np.float32)),
-                                  wrap_mode=dr.WrapMode.Clamp)
+        self._hull = mi.Texture3f(
+            mi.TensorXf(hull[..., None].astype(np.float32)), wrap_mode=dr.WrapMode.Clamp
+        )
         self._reach = _OUTSIDE * 2 / len(hull)
         self._sides = _sides(config)
         counts = np.round(np.multiply(_SHARES, config.iterations))
@@ -125,14 +135,23 @@ class RadianceVolume:
         mask = dr.sum(missing * dr.gather(mi.Float, dr.detach(missing), other))
         weight = self.pixels.mask_weight(config.mask)
         dr.backward(image + weight * mask)
-        adjoint = Adjoint(dr.detach(seen.radiance), dr.detach(seen.transmittance), seen.spread,
-                          dr.grad(seen.radiance), dr.grad(seen.transmittance),
-                          dr.opaque(mi.Float, config.distortion))
+        adjoint = Adjoint(
+            dr.detach(seen.radiance),
+            dr.detach(seen.transmittance),
+            seen.spread,
+            dr.grad(seen.radiance),
+            dr.grad(seen.transmittance),
+            dr.opaque(mi.Float, config.distortion),
+        )
         self._descend(composite(self.bricks, packets, rays, iteration, adjoint=adjoint), iteration)
         count = max(dr.width(alpha), 1)
         image, mask = image[0] / count, mask[0] / count
-        return {"loss": image + weight * mask, "image": image, "mask": mask,
-                "psnr": decibels(max(image / 3, 1e-9))}
+        return {
+            "loss": image + weight * mask,
+            "image": image,
+            "mask": mask,
+            "psnr": decibels(max(image / 3, 1e-9)),
+        }
 
     def preview(self) -> Preview:
         """The surface before: a fog has none yet."""
@@ -163,10 +182,13 @@ class RadianceVolume:
         density = dr.full(mi.Float, inverse_softplus(_FOG), count) if values is None else values["density"]
         to_hull = self._hull.eval(mi.Point3f(0.5 * (bricks.centres() + 1)))[0]
         outside = to_hull > dr.opaque(mi.Float, self._reach)
-        values = values or {"radiance": dr.full(mi.Float, self.mean_radiance, 3 * count),
-                            "direction": dr.zeros(mi.Float, 9 * count)}
-        self.optimizers["volume"] = mi.ad.Adam(lr=1.0, beta_2=0.99, params=values | {
-            "density": dr.select(outside, _EMPTY, density)})
+        values = values or {
+            "radiance": dr.full(mi.Float, self.mean_radiance, 3 * count),
+            "direction": dr.zeros(mi.Float, 9 * count),
+        }
+        self.optimizers["volume"] = mi.ad.Adam(
+            lr=1.0, beta_2=0.99, params=values | {"density": dr.select(outside, _EMPTY, density)}
+        )
 
     def _refine(self) -> None:
         """Goes on with voxels of half the size where something is."""
@@ -195,8 +217,9 @@ class RadianceVolume:
                 total = mi.Float(0)
                 for voxel, weight in nearby:
                     total += weight * dr.gather(mi.Float, values, voxel * size + channel)
-                dr.scatter(flat, total / dr.maximum(share, 1e-3), index * size + channel,
-                           mode=dr.ReduceMode.Permute)
+                dr.scatter(
+                    flat, total / dr.maximum(share, 1e-3), index * size + channel, mode=dr.ReduceMode.Permute
+                )
             results.append(flat)
         dr.eval(results)
         return results
@@ -214,8 +237,9 @@ class RadianceVolume:
 
     def _rays(self, step: int) -> tuple[Rays, mi.Color3f, mi.Float]:
         """Random pixels' rays, and the targets' radiance and coverage."""
-        sample = self.pixels.sample(self.config.batch // _RAYS, seed=self.seed, step=step,
-                                    rays=_RAYS, together=_TOGETHER)
+        sample = self.pixels.sample(
+            self.config.batch // _RAYS, seed=self.seed, step=step, rays=_RAYS, together=_TOGETHER
+        )
         ray = self.to_lattice @ self.views.rays(sample.view, sample.film)
         return Rays.through(self.bricks, ray, jitter=step), sample.radiance, sample.alpha
 
@@ -230,8 +254,12 @@ class RadianceVolume:
         dr.scatter(packets, mi.Vector4f(red, green, blue, depth), width * voxel, mode=dr.ReduceMode.Permute)
         for axis in range(width - 1):
             slope = dr.gather(mi.Vector3f, dr.detach(optimizer["direction"]), 3 * voxel + axis)
-            dr.scatter(packets, mi.Vector4f(slope.x, slope.y, slope.z, 0), width * voxel + (axis + 1),
-                       mode=dr.ReduceMode.Permute)
+            dr.scatter(
+                packets,
+                mi.Vector4f(slope.x, slope.y, slope.z, 0),
+                width * voxel + (axis + 1),
+                mode=dr.ReduceMode.Permute,
+            )
         dr.eval(packets)
         return packets
 
@@ -245,16 +273,21 @@ class RadianceVolume:
         slopes = dr.zeros(mi.Float, 9 * count)
         for axis in range(width - 1):
             slope = dr.gather(mi.Vector4f, gradient, width * voxel + (axis + 1))
-            dr.scatter(slopes, mi.Vector3f(slope.x, slope.y, slope.z), 3 * voxel + axis,
-                       mode=dr.ReduceMode.Permute)
+            dr.scatter(
+                slopes, mi.Vector3f(slope.x, slope.y, slope.z), 3 * voxel + axis, mode=dr.ReduceMode.Permute
+            )
         dr.set_grad(optimizer["direction"], slopes)
         begin, end = self._begins[self.level : self.level + 2]
         last = self.level == len(self._sides) - 1
         decay = (0.1 if last else 0.5) ** ((iteration - begin) / max(end - begin, 1))
         bright = decay * self.mean_radiance
-        optimizer.set_learning_rate({"density": decay * config.density_lr,
-                                     "radiance": bright * config.radiance_lr,
-                                     "direction": bright * config.direction_lr if self.level else 0.0})
+        optimizer.set_learning_rate(
+            {
+                "density": decay * config.density_lr,
+                "radiance": bright * config.radiance_lr,
+                "direction": bright * config.direction_lr if self.level else 0.0,
+            }
+        )
         optimizer.step()
         if self.level:
             kept = dr.opaque(mi.Float, 1 - _DIRECTION_DECAY)

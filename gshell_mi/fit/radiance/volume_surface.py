@@ -38,8 +38,13 @@ _COVERED = 0.5
 _FLOATER = 2.0
 
 
-def volume_surface(volume: RadianceVolume, scene: FitScene, lattice: Lattice, light: np.float32,
-                   progress: Callable[[], None] = lambda: None) -> Surface | None:
+def volume_surface(
+    volume: RadianceVolume,
+    scene: FitScene,
+    lattice: Lattice,
+    light: np.float32,
+    progress: Callable[[], None] = lambda: None,
+) -> Surface | None:
     """Finds the surface of a trained volume. It is closed, and a little outside of what is there.
 
     Every view tells how deep it sees, where its mask does not say that it sees nothing. What no view looks
@@ -67,8 +72,9 @@ def volume_surface(volume: RadianceVolume, scene: FitScene, lattice: Lattice, li
         depths.append(np.where(alpha < _COVERED, np.inf, unknown))
         progress()
     near = np.flatnonzero(distance < 2 * cell)
-    inside = fused_distance(mi.Point3f(points.numpy()[:, near]), views, depths, truncation=_TRUNCATION * cell,
-                            share=_VOTES)
+    inside = fused_distance(
+        mi.Point3f(points.numpy()[:, near]), views, depths, truncation=_TRUNCATION * cell, share=_VOTES
+    )
     distance[near] = np.maximum(distance[near], inside.numpy())
     outside = _without_specks((distance / cell).reshape((lattice.stride,) * 3), margin) - margin
     sdf = closed_at_border(lattice.spacing * outside.ravel(), lattice)

@@ -54,8 +54,16 @@ class PhotometricRefinement:
         seed: of the views whose outlines a step compares.
     """
 
-    def __init__(self, appearance: SurfaceRadiance, vertices: np.ndarray, faces: np.ndarray,
-                 outlines: Outlines | None, length: float, config: RefinementConfig, seed: int = 0):
+    def __init__(
+        self,
+        appearance: SurfaceRadiance,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        outlines: Outlines | None,
+        length: float,
+        config: RefinementConfig,
+        seed: int = 0,
+    ):
         self.appearance, self.faces, self.outlines, self.config = appearance, faces, outlines, config
         self.seed = seed
         self.length = length
@@ -89,8 +97,7 @@ class PhotometricRefinement:
         self._move(progress, iteration)
         appearance.update(("radiance",), config.radiance_lr)
         error = share * mean(dr.square(dr.detach(radiance) - sample.radiance))
-        return {"loss": total[0], "image": image[0], "outline": outline[0],
-                "psnr": decibels(error[0])}
+        return {"loss": total[0], "image": image[0], "outline": outline[0], "psnr": decibels(error[0])}
 
     def positions(self) -> np.ndarray:
         """(V, 3) world positions."""

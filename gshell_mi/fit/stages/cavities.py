@@ -54,9 +54,17 @@ class Cavities:
             surface = hollowed or surface
         if cubes and count:
             _, vertices, faces = closed_template(fit.scene.subject, surface.hull, lattice)
-            volume = RadianceVolume(surface.hull.reshape((lattice.stride,) * 3), vertices, faces,
-                                    fit.scene.subject.to_world, fit.views, fit.training, self.config,
-                                    steps.done, seed=fit.config.seed)
+            volume = RadianceVolume(
+                surface.hull.reshape((lattice.stride,) * 3),
+                vertices,
+                faces,
+                fit.scene.subject.to_world,
+                fit.views,
+                fit.training,
+                self.config,
+                steps.done,
+                seed=fit.config.seed,
+            )
             steps.run(volume, count, volume.optimizers, surface=surface)
             with steps.task("cut"):
                 carved = carve(fit, surface, volume)

@@ -49,12 +49,20 @@ class Exposures:
             if config.light_frame == "camera":
                 turns = np.array([np.array(turn.matrix)[:3, :3] for turn in turns_with_camera(scene.sensors)])
             mesh = scene.subject.surface_of(surface.fields).to_numpy()[:2]
-            seen = observe(mesh, fit.views, scene.targets, places=self.config.places, cell=fit.cell(surface),
-                           turns=turns, seed=config.seed)
+            seen = observe(
+                mesh,
+                fit.views,
+                scene.targets,
+                places=self.config.places,
+                cell=fit.cell(surface),
+                turns=turns,
+                seed=config.seed,
+            )
             found = find_gains(seen, self.config.prior * np.log(2))
         stops = float(found.log_gain.std() / np.log(2))
         kept = found.count and stops > self.config.least
-        steps.fact("exposures_verdict",
-                   found.verdict.facts() | {"look": found.look, "stops": round(stops, 4)})
+        steps.fact(
+            "exposures_verdict", found.verdict.facts() | {"look": found.look, "stops": round(stops, 4)}
+        )
         steps.fact("exposures_kept", kept)
         return replace(surface, gains=np.exp(found.log_gain).astype(np.float32)) if kept else surface

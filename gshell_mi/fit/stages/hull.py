@@ -55,12 +55,17 @@ class Hull:
         if not (hull.fields.sdf < 0).any():
             raise UserError(
                 f"The masks of the targets have no common volume in the box of '{fit.scene.path}'; check "
-                f"the cameras, the alpha of the targets and the gshell shape's to_world.")
+                f"the cameras, the alpha of the targets and the gshell shape's to_world."
+            )
         return hull
 
 
-def hulls_of(fit: Fit, alphas: list[np.ndarray], disbelieved: Sequence[int] = (0,),
-             progress: Callable[[], object] | None = None) -> list[Surface]:
+def hulls_of(
+    fit: Fit,
+    alphas: list[np.ndarray],
+    disbelieved: Sequence[int] = (0,),
+    progress: Callable[[], object] | None = None,
+) -> list[Surface]:
     """Visual hulls of some masks on the early lattice, with what is too thin for that grown.
 
     Args:
@@ -73,12 +78,22 @@ def hulls_of(fit: Fit, alphas: list[np.ndarray], disbelieved: Sequence[int] = (0
     points = mi.Transform4f(subject.to_world) @ mi.Point3f(samples.points(mi.Float))
     cell, vertices = lattice.spacing, lattice.points(mi.Float)
     found = []
-    for world in doubting_hulls(points, fit.views, alphas, disbelieved, progress=progress,
-                                daylight_votes=fit.config.hull.daylight_votes):
+    for world in doubting_hulls(
+        points,
+        fit.views,
+        alphas,
+        disbelieved,
+        progress=progress,
+        daylight_votes=fit.config.hull.daylight_votes,
+    ):
         solid = np.clip(world.numpy() / subject.length_scale, -1, 1) / cell
         grown = thickened(solid.reshape((samples.stride,) * 3), finer)
-        sdf, hull = (closed_at_border(Interpolation(mi.Float(cell * field.ravel()), samples)(vertices)
-                                      .numpy(), lattice) for field in (grown, solid))
+        sdf, hull = (
+            closed_at_border(
+                Interpolation(mi.Float(cell * field.ravel()), samples)(vertices).numpy(), lattice
+            )
+            for field in (grown, solid)
+        )
         found.append(Surface(LatticeFields.closed(sdf, lattice.grid), hull=hull))
     return found
 

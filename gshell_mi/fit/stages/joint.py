@@ -107,25 +107,40 @@ class Joint:
         subject, config = fit.scene.subject, fit.config
         fields = start_fields(subject, surface, lattice, config.lattice.band_resolution, steps.kept)
         subject.set_fields(fields)
-        joint = JointStage(fit.scene, start_material(fit.scene, surface, fields.lattice, config),
-                           start_light(fit.scene, surface, config), config, stage=self.config,
-                           iterations=self.iterations)
+        joint = JointStage(
+            fit.scene,
+            start_material(fit.scene, surface, fields.lattice, config),
+            start_light(fit.scene, surface, config),
+            config,
+            stage=self.config,
+            iterations=self.iterations,
+        )
         if joint.geometry.fitting_steps and not steps.done:
             with steps.task("start", joint.geometry.fitting_steps) as advance:
                 for iteration in range(joint.geometry.fitting_steps):
                     joint.geometry.fit_step(iteration)
                     advance()
                 joint.geometry.begin()
-        steps.run(joint, self.iterations, joint.optimizers, lambda: _prefixed(
-            _BLOCKS, block_arrays(subject.fields())))
+        steps.run(
+            joint,
+            self.iterations,
+            joint.optimizers,
+            lambda: _prefixed(_BLOCKS, block_arrays(subject.fields())),
+        )
         joint.finish()
-        result = replace(surface, fields=joint.moved_fields(), hull=None, moved=(), model=joint.model(),
-                         settled=True)
+        result = replace(
+            surface, fields=joint.moved_fields(), hull=None, moved=(), model=joint.model(), settled=True
+        )
         return with_open_sheets(fit, without_unseen_parts(fit, result))
 
 
-def start_fields(subject: mi.Shape, surface: Surface, lattice: Lattice, band_resolution: int,
-                 kept: Mapping[str, np.ndarray]) -> LatticeFields:
+def start_fields(
+    subject: mi.Shape,
+    surface: Surface,
+    lattice: Lattice,
+    band_resolution: int,
+    kept: Mapping[str, np.ndarray],
+) -> LatticeFields:
     """The fields of a surface on a lattice; in blocks if it is that fine.
 
     Args:
@@ -155,8 +170,9 @@ def block_arrays(fields: LatticeFields) -> dict[str, np.ndarray]:
     return {name: getattr(fields, name) for name in ("sdf", "msdf", "deform", "blocks")}
 
 
-def start_material(scene: FitScene, surface: Surface, lattice: Lattice | BlockLattice,
-                   config: FitConfig) -> MaterialField | GivenMaterial:
+def start_material(
+    scene: FitScene, surface: Surface, lattice: Lattice | BlockLattice, config: FitConfig
+) -> MaterialField | GivenMaterial:
     """The scene's own material or, as a field on a lattice, what a joint stage has left of it, or what is
     known of it and the colours that were seen."""
     given = given_material(scene.bsdf)
@@ -202,8 +218,9 @@ def start_light(scene: FitScene, surface: Surface, config: FitConfig) -> Environ
     if config.light_is_given:
         return None
     height = config.model.light_height
-    light = (EnvironmentLight.from_emitter(scene.light, height)
-             or EnvironmentLight.uniform(height, float(surface.seen.light)))
+    light = EnvironmentLight.from_emitter(scene.light, height) or EnvironmentLight.uniform(
+        height, float(surface.seen.light)
+    )
     if "log_radiance" in surface.model:
         light.log_radiance = mi.TensorXf(surface.model["log_radiance"])
     return light

@@ -77,8 +77,10 @@ class Occlusion:
                     facts[name] += values
                 chosen = (place >= 0) & verdict.accepted[place]
                 if chosen.any():
-                    ignored = [already | new for already, new in zip(ignored, _denying(fit, after, chosen),
-                                                                     strict=True)]
+                    ignored = [
+                        already | new
+                        for already, new in zip(ignored, _denying(fit, after, chosen), strict=True)
+                    ]
                     before, *larger = _meshes(fit, ignored, [0, *disbelieved])
                     shown = fit.judge.shown(before)
         views = sum(bool(pixels.any()) for pixels in ignored)

@@ -81,8 +81,15 @@ class Openings:
         template = template_of(fit.scene.subject, whole)
         vertices, faces, count = template.vertices, template.faces, self.config.iterations
         closed = fit.judge.shown(template.closed)
-        appearance = SurfaceRadiance(template.start, faces, fit.views, fit.pixels, fit.config.radiance,
-                                     seed=fit.config.seed, mirrored=closed.mirrored)
+        appearance = SurfaceRadiance(
+            template.start,
+            faces,
+            fit.views,
+            fit.pixels,
+            fit.config.radiance,
+            seed=fit.config.seed,
+            mirrored=closed.mirrored,
+        )
         training = OpacityTraining(appearance, self.config)
         if not fit.config.watertight:
             steps.run(training, count, {"radiance": appearance.optimizer})
@@ -91,11 +98,16 @@ class Openings:
             if not fit.config.watertight:
                 min_area = fit.config.topology.min_area
                 thickness, _ = opposite_sides(template.start, template.start, faces, fit.cell(surface))
-                logits = find_openings(appearance, closed, fit.judge, self.config.rounds,
-                                       lambda logits: close_shallow(
-                                           clean_opacity(logits, vertices, faces, min_area), faces,
-                                           np.isfinite(thickness)),
-                                       lambda again: steps.repeat(training, count, again * count))
+                logits = find_openings(
+                    appearance,
+                    closed,
+                    fit.judge,
+                    self.config.rounds,
+                    lambda logits: close_shallow(
+                        clean_opacity(logits, vertices, faces, min_area), faces, np.isfinite(thickness)
+                    ),
+                    lambda again: steps.repeat(training, count, again * count),
+                )
             opened = logits <= 0
             appearance.refit(~opened)
         front, _ = appearance.radiance()
@@ -136,16 +148,19 @@ class OpacityTraining:
         dr.backward(total)
         appearance.update(("opacity", "radiance"), appearance.config.lr * decay_at(progress))
         error = share * mean(dr.square(dr.detach(radiance) - sample.radiance))
-        return {"loss": total[0], "image": image[0], "mask": mask[0],
-                "psnr": decibels(error[0])}
+        return {"loss": total[0], "image": image[0], "mask": mask[0], "psnr": decibels(error[0])}
 
     def preview(self) -> Preview:
         """What is not clearly fading."""
         return self.appearance.preview()
 
 
-def justified(smoothed: np.ndarray, logits: np.ndarray, clean: Callable[[np.ndarray], np.ndarray],
-              judged: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def justified(
+    smoothed: np.ndarray,
+    logits: np.ndarray,
+    clean: Callable[[np.ndarray], np.ndarray],
+    judged: Callable[[np.ndarray], np.ndarray],
+) -> np.ndarray:
     """Openings, proposed at one level of opacity after the other.
 
     Args:
@@ -169,8 +184,14 @@ def justified(smoothed: np.ndarray, logits: np.ndarray, clean: Callable[[np.ndar
     return logits
 
 
-def find_openings(appearance: SurfaceRadiance, template: Shown, judge: Judge, rounds: int,
-                  clean: Callable[[np.ndarray], np.ndarray], train: Callable[[int], None]) -> np.ndarray:
+def find_openings(
+    appearance: SurfaceRadiance,
+    template: Shown,
+    judge: Judge,
+    rounds: int,
+    clean: Callable[[np.ndarray], np.ndarray],
+    train: Callable[[int], None],
+) -> np.ndarray:
     """Where the images justify an opening.
 
     Args:
@@ -193,8 +214,16 @@ def find_openings(appearance: SurfaceRadiance, template: Shown, judge: Judge, ro
         smoothed = appearance.smoothed_logits()
         proposed = clean(np.where(opened, np.minimum(smoothed, _OPEN), smoothed))
         logits = np.where(opened, _OPEN, np.abs(smoothed))
-        logits = clean(justified(smoothed, logits, clean, lambda candidate: open_rejected(
-            clean(close_rejected(candidate, template, judge, template.whole)), template, judge)))
+        logits = clean(
+            justified(
+                smoothed,
+                logits,
+                clean,
+                lambda candidate: open_rejected(
+                    clean(close_rejected(candidate, template, judge, template.whole)), template, judge
+                ),
+            )
+        )
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
         unjustified |= (proposed <= 0) & (logits > 0)

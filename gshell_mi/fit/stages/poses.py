@@ -81,9 +81,15 @@ class Poses:
 def _facts(fit: Fit, corrections: Corrections, points: np.ndarray) -> dict[str, Any]:
     """How far cameras are corrected: in the median, and each."""
     degrees = np.degrees(np.linalg.norm(corrections.rotations, axis=1))
-    columns = {"degrees": degrees, "shift": np.linalg.norm(corrections.shifts, axis=1),
-               "pixels": corrections.in_pixels(fit.views, points)}
+    columns = {
+        "degrees": degrees,
+        "shift": np.linalg.norm(corrections.shifts, axis=1),
+        "pixels": corrections.in_pixels(fit.views, points),
+    }
     medians = {f"median_{name}": round(float(np.median(values)), 4) for name, values in columns.items()}
-    return medians | {"views": {name: {column: round(float(values[view]), 4)
-                                       for column, values in columns.items()}
-                                for view, name in enumerate(fit.views.ids)}}
+    return medians | {
+        "views": {
+            name: {column: round(float(values[view]), 4) for column, values in columns.items()}
+            for view, name in enumerate(fit.views.ids)
+        }
+    }

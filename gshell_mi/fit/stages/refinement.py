@@ -77,8 +77,15 @@ class Refinement:
         steps.fact(f"{self.name}_kept", False)
         template = template_of(fit.scene.subject, surface)
         start, judge = template.start, fit.held_out_judge
-        appearance = SurfaceRadiance(start, template.faces, fit.views, fit.training, fit.config.radiance,
-                                     seed=fit.config.seed, mirrored=judge.shown(template.surface).mirrored)
+        appearance = SurfaceRadiance(
+            start,
+            template.faces,
+            fit.views,
+            fit.training,
+            fit.config.radiance,
+            seed=fit.config.seed,
+            mirrored=judge.shown(template.surface).mirrored,
+        )
         if self.first:
             appearance.move(mi.Float(start.ravel()))
             appearance.refit_anew(template.solid)
@@ -99,16 +106,27 @@ class Refinement:
         moved = (after, *surface.moved) if accepted else (*surface.moved, after)
         return replace(surface, moved=moved)
 
-    def _moved(self, appearance: SurfaceRadiance, template: Template, positions: np.ndarray, fit: Fit,
-               steps: Steps, cell: float) -> Moved | None:
+    def _moved(
+        self,
+        appearance: SurfaceRadiance,
+        template: Template,
+        positions: np.ndarray,
+        fit: Fit,
+        steps: Steps,
+        cell: float,
+    ) -> Moved | None:
         """The template after the steps; None if they get nowhere."""
         outlines = None
         if fit.training.has_alpha:
             outlines = Outlines(fit.views, fit.scene.targets, template.faces, template.solid)
-        refinement = PhotometricRefinement(appearance, positions, template.faces, outlines, cell, self.config,
-                                           fit.config.seed)
-        run = partial(steps.run, count=self.config.iterations,
-                      optimizers={"radiance": appearance.optimizer, "refinement": refinement.optimizer})
+        refinement = PhotometricRefinement(
+            appearance, positions, template.faces, outlines, cell, self.config, fit.config.seed
+        )
+        run = partial(
+            steps.run,
+            count=self.config.iterations,
+            optimizers={"radiance": appearance.optimizer, "refinement": refinement.optimizer},
+        )
         if self.config.descent is None:
             run(refinement)
         else:

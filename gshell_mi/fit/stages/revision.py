@@ -58,17 +58,28 @@ class Revision:
         vertices, faces, _ = template.to_numpy()
         values = template.interpolate(mi.Float(fields.msdf)).numpy() / lattice.spacing
         now = fit.judge.shown(positive_part(vertices, faces, values))
-        appearance = SurfaceRadiance(vertices, faces, fit.views, fit.pixels, fit.config.radiance,
-                                     seed=fit.config.seed, mirrored=now.mirrored)
-        steps.run(OpacityTraining(appearance, self.config), self.config.iterations,
-                  {"radiance": appearance.optimizer})
+        appearance = SurfaceRadiance(
+            vertices,
+            faces,
+            fit.views,
+            fit.pixels,
+            fit.config.radiance,
+            seed=fit.config.seed,
+            mirrored=now.mirrored,
+        )
+        steps.run(
+            OpacityTraining(appearance, self.config),
+            self.config.iterations,
+            {"radiance": appearance.optimizer},
+        )
         with steps.task("verdict"):
             proposed = appearance.smoothed_logits()
             thickness, opposite = opposite_sides(vertices, vertices, faces, cell)
             thin = np.isfinite(thickness)
             smooth = least_bent(vertices, faces, (values <= 0) & ~thin)
-            revised = _closed(fit.judge, fit.judge.shown((smooth, faces), like=now), values,
-                              np.where(thin, opposite, -1))
+            revised = _closed(
+                fit.judge, fit.judge.shown((smooth, faces), like=now), values, np.where(thin, opposite, -1)
+            )
             capped = (values <= 0) & (revised > 0)
             moved = np.where(capped[:, None], smooth, vertices)
             shown = fit.judge.shown((moved, faces), like=now)
@@ -140,8 +151,9 @@ def _with_islands(judge: Judge, template: Shown, values: np.ndarray, proposed: n
     return values
 
 
-def _opened(fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray,
-            thin: np.ndarray) -> np.ndarray:
+def _opened(
+    fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray, thin: np.ndarray
+) -> np.ndarray:
     """(V,) values, negative also where unseen views are explained better without the surface.
 
     Args:
@@ -160,8 +172,9 @@ def _opened(fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray,
         return np.where(given, values, close_shallow(np.where(given, 1.0, cleaned), faces, thin))
 
     start = np.where(given, values, np.abs(proposed))
-    values = justified(proposed, start, clean, lambda candidate: close_rejected(
-        candidate, template, fit.judge, now, given))
+    values = justified(
+        proposed, start, clean, lambda candidate: close_rejected(candidate, template, fit.judge, now, given)
+    )
     opened = (values <= 0) & ~given
     if not opened.any():
         return values

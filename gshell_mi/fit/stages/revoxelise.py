@@ -44,8 +44,9 @@ class Revoxelise:
             return without_unseen_parts(fit, found or replace(surface, hull=None, moved=()))
 
 
-def _whole(fit: Fit, template: Template, moved: Iterable[Moved],
-           surface: Surface) -> tuple[Surface | None, str]:
+def _whole(
+    fit: Fit, template: Template, moved: Iterable[Moved], surface: Surface
+) -> tuple[Surface | None, str]:
     """The first movement, of the best first, of which fields can be made, cut as well as can be, and its
     stage; None and an empty name if none comes out whole."""
     subject, lattice, min_area = fit.scene.subject, surface.lattice, fit.config.topology.min_area
@@ -53,8 +54,18 @@ def _whole(fit: Fit, template: Template, moved: Iterable[Moved],
         if (candidate.positions == template.vertices).all():
             continue
         for cut in _cuts(fit, template, candidate.positions, fit.cell(surface)):
-            fields = revoxelise(subject, lattice, template.vertices, cut.positions, template.faces,
-                                cut.logits, candidate.radiance, min_area, cut.topology, cut.fewest_loops)
+            fields = revoxelise(
+                subject,
+                lattice,
+                template.vertices,
+                cut.positions,
+                template.faces,
+                cut.logits,
+                candidate.radiance,
+                min_area,
+                cut.topology,
+                cut.fewest_loops,
+            )
             if fields:
                 closed = LatticeFields.closed(fields["sdf"], lattice.grid)
                 seen = Seen(fields["radiance"], fields["known"], surface.seen.light)
@@ -71,6 +82,12 @@ def _cuts(fit: Fit, template: Template, moved: np.ndarray, cell: float) -> list[
     as_found = Cut(logits, moved, found, found.boundary_loops)
     if config.watertight or not config.topology.sheet_thickness:
         return [as_found]
-    cut = collapsed_sheets(as_found, template.vertices, template.faces, cell, config.topology.sheet_thickness,
-                           config.topology.min_area)
+    cut = collapsed_sheets(
+        as_found,
+        template.vertices,
+        template.faces,
+        cell,
+        config.topology.sheet_thickness,
+        config.topology.min_area,
+    )
     return [cut, as_found] if cut else [as_found]

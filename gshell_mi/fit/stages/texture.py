@@ -53,15 +53,30 @@ class Texture:
         normals = np.array(mesh.vertex_normals().numpy()).T
         attributes = attributes_of(fitted.material, mesh) | {"normal": normals}
         vertices, faces, fine = subdivided(vertices, faces, attributes, levels)
-        start = FineMesh(vertices, faces, unit(fine["normal"]), fine["vertex_color"],
-                         fine["vertex_roughness"], fine["vertex_metallic"])
+        start = FineMesh(
+            vertices,
+            faces,
+            unit(fine["normal"]),
+            fine["vertex_color"],
+            fine["vertex_roughness"],
+            fine["vertex_metallic"],
+        )
         turns = fit.config.light_frame == "camera" and fitted.light
         lights = [fitted.light.turned(turn) for turn in turns_with_camera(fit.scene.sensors)] if turns else []
-        work = BackProjection(start, other_objects(fit.scene, fitted.light), fit.scene.sensors, fit.views,
-                              fit.scene.targets, lights, steps.kept, seed=fit.config.seed)
+        work = BackProjection(
+            start,
+            other_objects(fit.scene, fitted.light),
+            fit.scene.sensors,
+            fit.views,
+            fit.scene.targets,
+            lights,
+            steps.kept,
+            seed=fit.config.seed,
+        )
         steps.run(work, self.config.rounds * len(fit.views), {}, work.state)
-        return replace(surface, model={**surface.model, "texture": work.colors(),
-                                       "texture_levels": np.array(levels)})
+        return replace(
+            surface, model={**surface.model, "texture": work.colors(), "texture_levels": np.array(levels)}
+        )
 
 
 def _levels(vertices: np.ndarray, faces: np.ndarray, fit: Fit) -> int:

@@ -45,8 +45,9 @@ class Volume:
         steps.fact("volume_kept", bool(verdict.accepted[0]))
         return without_unseen_parts(fit, other) if verdict.accepted[0] else surface
 
-    def _volume(self, fit: Fit, surface: tuple[np.ndarray, np.ndarray],
-                kept: Mapping[str, np.ndarray]) -> RadianceVolume:
+    def _volume(
+        self, fit: Fit, surface: tuple[np.ndarray, np.ndarray], kept: Mapping[str, np.ndarray]
+    ) -> RadianceVolume:
         """A radiance volume inside the visual hull, or the one that was begun."""
         side, subject = RadianceVolume.first_side(self.config), fit.scene.subject
         centre = (np.arange(side, dtype=np.float32) + 0.5) * (2 / side) - 1
@@ -54,8 +55,9 @@ class Volume:
         points = mi.Transform4f(subject.to_world) @ mi.Point3f(x, y, z)
         hull = visual_hull(points, fit.views, fit.alphas)
         hull = np.clip(hull.numpy() / subject.length_scale, -1, 1).reshape((side,) * 3)
-        return RadianceVolume(hull, subject.to_world, fit.views, fit.pixels, self.config, surface, kept,
-                              seed=fit.config.seed)
+        return RadianceVolume(
+            hull, subject.to_world, fit.views, fit.pixels, self.config, surface, kept, seed=fit.config.seed
+        )
 
 
 def _as_fine(surface: tuple[np.ndarray, np.ndarray], length: float) -> tuple[np.ndarray, np.ndarray]:

@@ -66,7 +66,11 @@ def garment(kind: str, seed: int) -> Garment:
 
 def _is_right(found: Topology, loops: int) -> bool:
     return (found.components, found.boundary_loops, found.pinholes, found.nonmanifold_edges) == (
-        1, loops, 0, 0)
+        1,
+        loops,
+        0,
+        0,
+    )
 
 
 def _sewn(kind: str, parameters: dict[str, float], rng: np.random.Generator) -> trimesh.Trimesh | None:

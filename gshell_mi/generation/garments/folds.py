@@ -26,7 +26,9 @@ def wrinkles(p: Array3f, rng: np.random.Generator) -> Float:
     for _ in range(4):
         direction = rng.normal(size=3)
         direction *= rng.uniform(4, 14) / np.linalg.norm(direction)
-        size, phase, *wave = (dr.opaque(type(p.x), float(value)) for value in (
-            rng.uniform(0.001, 0.007), rng.uniform(0, 2 * np.pi), *direction))
+        size, phase, *wave = (
+            dr.opaque(type(p.x), float(value))
+            for value in (rng.uniform(0.001, 0.007), rng.uniform(0, 2 * np.pi), *direction)
+        )
         height += size * dr.sin(dr.dot(p, type(p)(*wave)) + phase)
     return height

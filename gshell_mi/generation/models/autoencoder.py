@@ -49,10 +49,19 @@ def seen(fields: Tensor) -> Seen:
     near = sdf.abs() < _NEAR_CELLS / TRUNCATION_CELLS
     scaled = (fields * (TRUNCATION_CELLS / _SEEN_CELLS)).clamp(-1, 1)
     one = torch.ones_like(sdf)
-    values = torch.stack([torch.where(cap, torch.where(sdf < 0, -one, one), scaled[:, 0]),
-                          torch.where(near, scaled[:, 1], one)], dim=1)
-    return Seen(values, values.abs() < 1, torch.stack([torch.where(cap, _CAP_MARGIN, one), one], dim=1),
-                torch.stack([torch.where(cap, _CAP_WEIGHT, one), near.to(one.dtype)], dim=1))
+    values = torch.stack(
+        [
+            torch.where(cap, torch.where(sdf < 0, -one, one), scaled[:, 0]),
+            torch.where(near, scaled[:, 1], one),
+        ],
+        dim=1,
+    )
+    return Seen(
+        values,
+        values.abs() < 1,
+        torch.stack([torch.where(cap, _CAP_MARGIN, one), one], dim=1),
+        torch.stack([torch.where(cap, _CAP_WEIGHT, one), near.to(one.dtype)], dim=1),
+    )
 
 
 class Residual(nn.Module):
@@ -86,14 +95,27 @@ class Autoencoder(nn.Module):
         super().__init__()
         fine, middle, coarse = widths
         self.encoder = nn.Sequential(
-            nn.Conv3d(16, fine, 3, padding=1), Residual(fine),
-            nn.Conv3d(fine, middle, 2, stride=2), Residual(middle), Residual(middle),
-            nn.Conv3d(middle, coarse, 2, stride=2), Residual(coarse), nn.Conv3d(coarse, channels, 1))
+            nn.Conv3d(16, fine, 3, padding=1),
+            Residual(fine),
+            nn.Conv3d(fine, middle, 2, stride=2),
+            Residual(middle),
+            Residual(middle),
+            nn.Conv3d(middle, coarse, 2, stride=2),
+            Residual(coarse),
+            nn.Conv3d(coarse, channels, 1),
+        )
         self.decoder = nn.Sequential(
-            nn.Conv3d(channels, coarse, 3, padding=1), Residual(coarse), Residual(coarse),
-            nn.ConvTranspose3d(coarse, middle, 2, stride=2), Residual(middle), Residual(middle),
-            nn.ConvTranspose3d(middle, fine, 2, stride=2), Residual(fine), Residual(fine),
-            nn.Conv3d(fine, 16, 3, padding=1))
+            nn.Conv3d(channels, coarse, 3, padding=1),
+            Residual(coarse),
+            Residual(coarse),
+            nn.ConvTranspose3d(coarse, middle, 2, stride=2),
+            Residual(middle),
+            Residual(middle),
+            nn.ConvTranspose3d(middle, fine, 2, stride=2),
+            Residual(fine),
+            Residual(fine),
+            nn.Conv3d(fine, 16, 3, padding=1),
+        )
         self.register_buffer("mean", torch.zeros(channels))
         self.register_buffer("deviation", torch.ones(channels))
 

@@ -34,6 +34,9 @@ class CodedSet:
         chosen = chosen.to(self.values.device)
         x = self.values[chosen].to(device).float()
         dropped = torch.rand(count, generator=generator, device=device) < _DROPPED
-        return {"x": x, "noise": torch.randn(x.shape, generator=generator, device=device),
-                "t": torch.sigmoid(torch.randn(count, generator=generator, device=device)),
-                "kinds": torch.where(dropped, classes, self.kinds[chosen].to(device))}
+        return {
+            "x": x,
+            "noise": torch.randn(x.shape, generator=generator, device=device),
+            "t": torch.sigmoid(torch.randn(count, generator=generator, device=device)),
+            "kinds": torch.where(dropped, classes, self.kinds[chosen].to(device)),
+        }

@@ -39,9 +39,16 @@ class DenseDiffusion(nn.Module):
         channels = tuple(base * min(2**level, 4) for level in range(levels))
         attention = tuple(config.side >> level <= 16 and level > 0 for level in range(levels))
         self.network = DiffusionModelUNet(
-            spatial_dims=3, in_channels=2, out_channels=2, channels=channels, attention_levels=attention,
-            num_res_blocks=1, num_head_channels=base, norm_num_groups=min(8, base),
-            num_class_embeds=len(config.classes) + 1)
+            spatial_dims=3,
+            in_channels=2,
+            out_channels=2,
+            channels=channels,
+            attention_levels=attention,
+            num_res_blocks=1,
+            num_head_channels=base,
+            norm_num_groups=min(8, base),
+            num_class_embeds=len(config.classes) + 1,
+        )
         at = torch.linspace(0, 1, _TIMES + 1, dtype=torch.float64)
         signal = torch.cos((at + 0.008) / 1.008 * torch.pi / 2).square()
         self.register_buffer("signal", (signal / signal[0])[1:].clamp(min=1e-5).float(), persistent=False)
@@ -62,22 +69,27 @@ class DenseDiffusion(nn.Module):
         """What a stage draws its batches from."""
         return data
 
-    def draw(self, stage: str, data: TrainingSet, chosen: Tensor,
-             generator: torch.Generator) -> dict[str, Tensor]:
+    def draw(
+        self, stage: str, data: TrainingSet, chosen: Tensor, generator: torch.Generator
+    ) -> dict[str, Tensor]:
         """A batch of the rows ``chosen``, with all its chance, on the generator's device."""
         device, count = generator.device, len(chosen)
         x = data.fields(chosen, device)
         dropped = torch.rand(count, generator=generator, device=device) < _DROPPED
-        return {"x": x, "noise": torch.randn(x.shape, generator=generator, device=device),
-                "step": torch.randint(_TIMES, (count,), generator=generator, device=device),
-                "kinds": torch.where(dropped, len(self.config.classes), data.kinds[chosen].to(device))}
+        return {
+            "x": x,
+            "noise": torch.randn(x.shape, generator=generator, device=device),
+            "step": torch.randint(_TIMES, (count,), generator=generator, device=device),
+            "kinds": torch.where(dropped, len(self.config.classes), data.kinds[chosen].to(device)),
+        }
 
     def forward(self, batch: dict[str, Tensor]) -> Tensor:
         """The mean squared error of the noise."""
         noise, step = batch["noise"], batch["step"]
         signal = self.signal[step].view(-1, 1, 1, 1, 1)
-        found = self.network(signal.sqrt() * batch["x"] + (1 - signal).sqrt() * noise, step,
-                             class_labels=batch["kinds"])
+        found = self.network(
+            signal.sqrt() * batch["x"] + (1 - signal).sqrt() * noise, step, class_labels=batch["kinds"]
+        )
         return (found.float() - noise).square().mean()
 
     @torch.no_grad()

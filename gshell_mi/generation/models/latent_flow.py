@@ -48,8 +48,15 @@ class LatentFlow(nn.Module):
         shape = config.shape
         self.channels = shape.latents
         self.autoencoder = Autoencoder(shape.latents, shape.features)
-        self.flow = TokenTransformer(shape.latents * self.group**3, self.per_side // self.group,
-                                     len(config.classes), shape.width, shape.depth, shape.heads, _DROPOUT)
+        self.flow = TokenTransformer(
+            shape.latents * self.group**3,
+            self.per_side // self.group,
+            len(config.classes),
+            shape.width,
+            shape.depth,
+            shape.heads,
+            _DROPOUT,
+        )
 
     # -- training -------------------------------------------------------------------------------------
 
@@ -70,17 +77,22 @@ class LatentFlow(nn.Module):
         """What a stage draws its batches from."""
         if stage == "autoencoder":
             return data
-        kept = [self._tokens(self.autoencoder.encode(part)).half() for part in data.parts(
-            _CHUNK, self.autoencoder.mean.device)]
+        kept = [
+            self._tokens(self.autoencoder.encode(part)).half()
+            for part in data.parts(_CHUNK, self.autoencoder.mean.device)
+        ]
         return CodedSet(torch.cat(kept), data.kinds.to(kept[0].device))
 
-    def draw(self, stage: str, data: TrainingSet | CodedSet, chosen: Tensor,
-             generator: torch.Generator) -> dict[str, Tensor]:
+    def draw(
+        self, stage: str, data: TrainingSet | CodedSet, chosen: Tensor, generator: torch.Generator
+    ) -> dict[str, Tensor]:
         """A batch of the rows ``chosen``, with all its chance, on the generator's device."""
         if isinstance(data, TrainingSet):
             device, size = generator.device, (len(chosen), self.channels, *3 * (self.per_side,))
-            return {"fields": data.fields(chosen, device),
-                    "noise": torch.randn(size, generator=generator, device=device)}
+            return {
+                "fields": data.fields(chosen, device),
+                "noise": torch.randn(size, generator=generator, device=device),
+            }
         return data.draw(chosen, len(self.config.classes), generator)
 
     def forward(self, batch: dict[str, Tensor]) -> Tensor:
@@ -123,8 +135,9 @@ class LatentFlow(nn.Module):
             held = self._tokens(self._whole_blocks(steering.known, device).expand_as(goal)) > 0
             away = ndimage.distance_transform_edt(steering.known)
             kept = torch.from_numpy(np.clip(away / _BLEND_CELLS, 0, 1).astype(np.float32)).to(device)
-        tokens = self._flow(self._tokens(noise), steering, None if goal is None else self._tokens(goal), held,
-                            told)
+        tokens = self._flow(
+            self._tokens(noise), steering, None if goal is None else self._tokens(goal), held, told
+        )
         found = []
         for latents in self._latents(tokens).split(_CHUNK):
             fields = self.autoencoder.decode(latents)
@@ -134,8 +147,14 @@ class LatentFlow(nn.Module):
             found.append(fields.clamp(-1, 1).cpu().numpy())
         return np.concatenate(found)
 
-    def _flow(self, noise: Tensor, steering: Steering, goal: Tensor | None, held: Tensor | None,
-              told: Callable[[], None]) -> Tensor:
+    def _flow(
+        self,
+        noise: Tensor,
+        steering: Steering,
+        goal: Tensor | None,
+        held: Tensor | None,
+        told: Callable[[], None],
+    ) -> Tensor:
         """From noise to data by Heun's method, the last step by Euler's.
 
         Args:
@@ -182,8 +201,9 @@ class LatentFlow(nn.Module):
     def _latents(self, tokens: Tensor) -> Tensor:
         coarse, group = self.per_side // self.group, self.group
         split = tokens.view(len(tokens), coarse, coarse, coarse, self.channels, group, group, group)
-        return split.permute(0, 4, 1, 5, 2, 6, 3, 7).reshape(len(tokens), self.channels,
-                                                             *3 * (self.per_side,))
+        return split.permute(0, 4, 1, 5, 2, 6, 3, 7).reshape(
+            len(tokens), self.channels, *3 * (self.per_side,)
+        )
 
     def _whole_blocks(self, known: np.ndarray, device: torch.device) -> Tensor:
         """(1, 1, n, n, n): 1 for the blocks that are known everywhere."""

@@ -27,7 +27,8 @@ class Perceptron(nn.Module):
         self.condition = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.layers = nn.ModuleList(
             nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Dropout(dropout), nn.Linear(width, width))
-            for _ in range(layers))
+            for _ in range(layers)
+        )
         self.modulation = nn.Parameter(torch.zeros(layers, 2, width))
         self.shared = nn.Linear(width, 2 * width)
         self.out = nn.Linear(width, values)

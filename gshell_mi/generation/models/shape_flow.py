@@ -59,16 +59,19 @@ class ShapeFlow(nn.Module):
         shape = config.shape
         self.nodes = min(_NODES, config.side)
         self.components = shape.components
-        self.flow = Perceptron(shape.components, len(config.classes), shape.perceptron, shape.layers,
-                               _DROPOUT)
+        self.flow = Perceptron(
+            shape.components, len(config.classes), shape.perceptron, shape.layers, _DROPOUT
+        )
         values = 2 * self.nodes**3
         self.register_buffer("mean", torch.zeros(values))
         self.register_buffer("basis", torch.zeros((shape.components, values), dtype=torch.int8))
         self.register_buffer("scale", torch.zeros(shape.components))
         self.register_buffer("weight", torch.ones(shape.components))
         at = np.linspace(0, self.nodes - 1, config.side)
-        spline = np.stack([ndimage.map_coordinates(row, [at], order=3, mode="nearest")
-                           for row in np.eye(self.nodes)], axis=1)
+        spline = np.stack(
+            [ndimage.map_coordinates(row, [at], order=3, mode="nearest") for row in np.eye(self.nodes)],
+            axis=1,
+        )
         self.register_buffer("spline", torch.from_numpy(spline).float(), persistent=False)
         self.register_buffer("fit", torch.from_numpy(np.linalg.pinv(spline)).float(), persistent=False)
 
@@ -103,7 +106,7 @@ class ShapeFlow(nn.Module):
         # Of few objects by their products, n x n, not by those of tens of thousands of nodes.
         _, vectors = torch.linalg.eigh((centred @ centred.T).double())
         kept = min(self.components, len(centred) - 1)
-        found = (vectors.flip(1)[:, :kept].T.float() @ centred)  # (kept, values), not normalised
+        found = vectors.flip(1)[:, :kept].T.float() @ centred  # (kept, values), not normalised
         found = found / found.norm(dim=1, keepdim=True)
         deviation = (centred @ found.T).square().mean(dim=0).sqrt()
         found = found * deviation[:, None]
@@ -123,8 +126,9 @@ class ShapeFlow(nn.Module):
         basis = self._basis()
         return (basis / basis.square().sum(dim=1, keepdim=True).clamp(min=1e-12)).T
 
-    def draw(self, stage: str, data: CodedSet, chosen: Tensor,
-             generator: torch.Generator) -> dict[str, Tensor]:
+    def draw(
+        self, stage: str, data: CodedSet, chosen: Tensor, generator: torch.Generator
+    ) -> dict[str, Tensor]:
         """A batch of the rows ``chosen``, with all its chance, on the generator's device."""
         return data.draw(chosen, len(self.config.classes), generator)
 
@@ -175,8 +179,14 @@ class ShapeFlow(nn.Module):
             found.append(fields.clamp(-1, 1).cpu().numpy())
         return np.concatenate(found)
 
-    def _flow(self, noise: Tensor, steering: Steering, goal: Tensor | None,
-              toward: Callable[[Tensor], Tensor] | None, told: Callable[[], None]) -> Tensor:
+    def _flow(
+        self,
+        noise: Tensor,
+        steering: Steering,
+        goal: Tensor | None,
+        toward: Callable[[Tensor], Tensor] | None,
+        told: Callable[[], None],
+    ) -> Tensor:
         """From noise to data by Heun's method, the last step by Euler's.
 
         Args:

@@ -34,8 +34,12 @@ class Steering:
         """
         found = []
         for first, second, part in self.seeds:
-            a, b = (torch.from_numpy(np.random.default_rng([seed, stream]).standard_normal(
-                shape, dtype=np.float32)) for seed in (first, second))
+            a, b = (
+                torch.from_numpy(
+                    np.random.default_rng([seed, stream]).standard_normal(shape, dtype=np.float32)
+                )
+                for seed in (first, second)
+            )
             angle = part * torch.pi / 2
             found.append(np.cos(angle) * a + np.sin(angle) * b if part else a)
         return torch.stack(found).float()

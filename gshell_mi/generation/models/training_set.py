@@ -26,8 +26,9 @@ class TrainingSet:
     kinds: Tensor
     """(objects,)."""
 
-    def __init__(self, sdf: np.ndarray, msdf: np.ndarray, kinds: list[int], *, mirror: bool,
-                 device: torch.device):
+    def __init__(
+        self, sdf: np.ndarray, msdf: np.ndarray, kinds: list[int], *, mirror: bool, device: torch.device
+    ):
         home = torch.device("cpu")
         if device.type == "cuda" and sdf.nbytes + msdf.nbytes < _MOST * torch.cuda.mem_get_info(device)[0]:
             home = device

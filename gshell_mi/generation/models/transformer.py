@@ -28,8 +28,12 @@ class Block(nn.Module):
         self.heads = heads
         self.into = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
-        self.perceptron = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(approximate="tanh"),
-                                        nn.Dropout(dropout), nn.Linear(4 * width, width))
+        self.perceptron = nn.Sequential(
+            nn.Linear(width, 4 * width),
+            nn.GELU(approximate="tanh"),
+            nn.Dropout(dropout),
+            nn.Linear(4 * width, width),
+        )
         self.dropout = nn.Dropout(dropout)
         self.modulation = nn.Parameter(torch.zeros(6, width))
 
@@ -55,8 +59,16 @@ class TokenTransformer(nn.Module):
         dropout: of what each half of a block adds, while training.
     """
 
-    def __init__(self, values: int, per_side: int, classes: int, width: int, depth: int, heads: int,
-                 dropout: float = 0.0):
+    def __init__(
+        self,
+        values: int,
+        per_side: int,
+        classes: int,
+        width: int,
+        depth: int,
+        heads: int,
+        dropout: float = 0.0,
+    ):
         super().__init__()
         self.width, self.per_side = width, per_side
         self.into = nn.Linear(values, width)

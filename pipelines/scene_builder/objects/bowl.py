@@ -8,10 +8,18 @@ from ..lights import sunny_sky
 from ..modelling import even_profile, revolve, smooth_step
 
 #: Profile from the centre of the foot to the lip: radius, height.
-PROFILE = np.array([
-    [0.00, -0.50], [0.20, -0.50], [0.30, -0.49], [0.46, -0.43], [0.66, -0.27], [0.79, -0.04], [0.85, 0.20],
-    [0.90, 0.30],
-])
+PROFILE = np.array(
+    [
+        [0.00, -0.50],
+        [0.20, -0.50],
+        [0.30, -0.49],
+        [0.46, -0.43],
+        [0.66, -0.27],
+        [0.79, -0.04],
+        [0.85, 0.20],
+        [0.90, 0.30],
+    ]
+)
 COPPER, BRASS = np.array([0.93, 0.45, 0.30]), np.array([0.88, 0.72, 0.36])
 
 

@@ -17,8 +17,9 @@ from ..modelling import (
     torus,
 )
 
-FUR, PALE, PINK, DARK = (np.array(c) for c in (
-    [0.42, 0.24, 0.13], [0.82, 0.74, 0.62], [0.72, 0.32, 0.30], [0.03, 0.025, 0.025]))
+FUR, PALE, PINK, DARK = (
+    np.array(c) for c in ([0.42, 0.24, 0.13], [0.82, 0.74, 0.62], [0.72, 0.32, 0.30], [0.03, 0.025, 0.025])
+)
 
 
 def _ears(p: np.ndarray) -> np.ndarray:

@@ -31,7 +31,8 @@ def _back(p: np.ndarray) -> np.ndarray:
     posts = capsule(q, [0.42, 0.0, -0.43], [0.40, 0.95, -0.60], 0.075, 0.06)
     rails = np.minimum(
         capsule(q, [0.0, 0.84, -0.62], [0.40, 0.86, -0.585], 0.09),
-        capsule(q, [0.0, 0.46, -0.55], [0.41, 0.48, -0.515], 0.06))
+        capsule(q, [0.0, 0.46, -0.55], [0.41, 0.48, -0.515], 0.06),
+    )
     return smooth_union(posts, rails, 0.05)
 
 

@@ -35,16 +35,22 @@ def sheet(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     b, c, d = a + 1, a + columns, a + columns + 1
     # Diagonals mirror at the midrib, as the veins do.
     left = (j < columns // 2).ravel()
-    quads = np.concatenate([
-        np.stack([a, c, d], 1)[left], np.stack([a, d, b], 1)[left],
-        np.stack([a, c, b], 1)[~left], np.stack([b, c, d], 1)[~left],
-    ])
+    quads = np.concatenate(
+        [
+            np.stack([a, c, d], 1)[left],
+            np.stack([a, d, b], 1)[left],
+            np.stack([a, c, b], 1)[~left],
+            np.stack([b, c, d], 1)[~left],
+        ]
+    )
     j, last = np.arange(columns - 1), (rows - 1) * columns
     n = rows * columns
-    tips = np.concatenate([
-        np.stack([np.full_like(j, n), j, j + 1], 1),
-        np.stack([last + j, np.full_like(j, n + 1), last + j + 1], 1),
-    ])
+    tips = np.concatenate(
+        [
+            np.stack([np.full_like(j, n), j, j + 1], 1),
+            np.stack([last + j, np.full_like(j, n + 1), last + j + 1], 1),
+        ]
+    )
     return np.r_[u, 0, 1], np.r_[v, 0, 0], np.concatenate([quads, tips])
 
 
@@ -54,7 +60,9 @@ def build() -> SceneObject:
     x, side = _width(u) * v, np.abs(v)
     # Arched along its length, the halves folded up from the midrib, the rim waved, the tip turned down.
     z = (
-        0.22 * np.sin(np.pi * (0.15 + 0.95 * u)) + 0.45 * np.hypot(x, 0.05) - 0.25 * u**3
+        0.22 * np.sin(np.pi * (0.15 + 0.95 * u))
+        + 0.45 * np.hypot(x, 0.05)
+        - 0.25 * u**3
         + 0.035 * side**2 * np.sin(5.5 * np.pi * u + 0.8 * np.sign(v)) * np.sin(np.pi * u)
     )
     vein = _veins(u, v)

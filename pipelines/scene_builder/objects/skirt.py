@@ -47,8 +47,13 @@ def build() -> SceneObject:
     phi, r = np.arctan2(rest[:, 2], rest[:, 0]), np.hypot(rest[:, 0], rest[:, 2])
     ripple = 0.03 * (np.sin(9 * phi + 0.4) + 0.7 * np.sin(13 * phi + 2) + 0.5 * np.sin(4 * phi))
     start = rest + (ripple * smooth_step(r, WAIST, HEM))[:, None] * [0, 1, 0]
-    draped = drape(trimesh.Trimesh(start, pattern.faces, process=False), _body,
-                   bending=3e-5, thickness=0.05, friction=0.4)
+    draped = drape(
+        trimesh.Trimesh(start, pattern.faces, process=False),
+        _body,
+        bending=3e-5,
+        thickness=0.05,
+        friction=0.4,
+    )
     # The same subdivision of both shapes gives the same vertices in the same order.
     skirt = trimesh.Trimesh(draped, pattern.faces, process=False).subdivide_loop(1)
     cloth = np.asarray(pattern.subdivide_loop(1).vertices)

@@ -16,10 +16,14 @@ from gshell_mi.fit.bookkeeping.checkpoint import FORMAT, Checkpoint, optimizer_a
 @pytest.fixture
 def checkpoint() -> Checkpoint:
     rng = np.random.default_rng(0)
-    arrays = {"sdf": rng.normal(size=27).astype(np.float32), "known": np.array([True, False]),
-              "appearance/opacity/step": np.array([3], np.uint32)}
-    return Checkpoint("openings", 17, {"seed": 3, "resolution": None, "spp": 8, "warmup": 0.15}, arrays,
-                      {"hull": 1.25})
+    arrays = {
+        "sdf": rng.normal(size=27).astype(np.float32),
+        "known": np.array([True, False]),
+        "appearance/opacity/step": np.array([3], np.uint32),
+    }
+    return Checkpoint(
+        "openings", 17, {"seed": 3, "resolution": None, "spp": 8, "warmup": 0.15}, arrays, {"hull": 1.25}
+    )
 
 
 def test_round_trip(checkpoint, tmp_path):
@@ -91,8 +95,15 @@ def test_missing(tmp_path):
         Checkpoint.load(tmp_path / "none.npz")
 
 
-@pytest.mark.parametrize("damage", [lambda data: data[:100], lambda data: b"", lambda data: b"x" * 500,
-                                    lambda data: data[: len(data) // 2] + data[len(data) // 2 + 1:]])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data[:100],
+        lambda data: b"",
+        lambda data: b"x" * 500,
+        lambda data: data[: len(data) // 2] + data[len(data) // 2 + 1 :],
+    ],
+)
 def test_damaged(checkpoint, tmp_path, damage):
     path = tmp_path / "checkpoint.npz"
     checkpoint.save(path)
@@ -128,21 +139,31 @@ def rename(arrays, before, after):
     arrays[after] = arrays.pop(before)
 
 
-@pytest.mark.parametrize("change", [
-    lambda header, arrays: [1], lambda header, arrays: 5, lambda header, arrays: header | {"more": 1},
-    lambda header, arrays: header | {"stage": 3},
-    lambda header, arrays: header | {"iteration": -5}, lambda header, arrays: header | {"iteration": "1"},
-    lambda header, arrays: header | {"iteration": True}, lambda header, arrays: header | {"config": []},
-    lambda header, arrays: header | {"seconds": [1]},
-    lambda header, arrays: header | {"seconds": {"hull": "1"}},
-    lambda header, arrays: header | {"inputs": 1}, lambda header, arrays: header | {"inputs": {"views": 1}},
-    lambda header, arrays: header.pop("arrays") and None, lambda header, arrays: header.pop("facts") and None,
-    lambda header, arrays: arrays.pop("sdf") is None, lambda header, arrays: rename(arrays, "sdf", "sdg"),
-    lambda header, arrays: arrays.update(sdf=np.array(["a", "b"])),
-    lambda header, arrays: arrays.update(sdf=arrays["sdf"][:8]),
-    lambda header, arrays: arrays.update(sdf=arrays["sdf"].astype(np.float64)),
-    lambda header, arrays: arrays.update(sdf=np.array([{}], object)),
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda header, arrays: [1],
+        lambda header, arrays: 5,
+        lambda header, arrays: header | {"more": 1},
+        lambda header, arrays: header | {"stage": 3},
+        lambda header, arrays: header | {"iteration": -5},
+        lambda header, arrays: header | {"iteration": "1"},
+        lambda header, arrays: header | {"iteration": True},
+        lambda header, arrays: header | {"config": []},
+        lambda header, arrays: header | {"seconds": [1]},
+        lambda header, arrays: header | {"seconds": {"hull": "1"}},
+        lambda header, arrays: header | {"inputs": 1},
+        lambda header, arrays: header | {"inputs": {"views": 1}},
+        lambda header, arrays: header.pop("arrays") and None,
+        lambda header, arrays: header.pop("facts") and None,
+        lambda header, arrays: arrays.pop("sdf") is None,
+        lambda header, arrays: rename(arrays, "sdf", "sdg"),
+        lambda header, arrays: arrays.update(sdf=np.array(["a", "b"])),
+        lambda header, arrays: arrays.update(sdf=arrays["sdf"][:8]),
+        lambda header, arrays: arrays.update(sdf=arrays["sdf"].astype(np.float64)),
+        lambda header, arrays: arrays.update(sdf=np.array([{}], object)),
+    ],
+)
 def test_crafted(checkpoint, tmp_path, change):
     path = tmp_path / "checkpoint.npz"
     checkpoint.save(path)

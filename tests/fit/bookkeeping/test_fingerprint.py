@@ -27,8 +27,11 @@ def test_given_fields_belong_to_it(bowl_scene, tmp_path):
         ball = sphere(TetLattice(20), radius)
         np.savez(tmp_path / "ball.npz", sdf=ball.sdf)
         scene = tmp_path / "ball.xml"
-        scene.write_text(bowl_scene.read_text().replace(
-            '<integer name="resolution" value="20"/>', '<string name="filename" value="ball.npz"/>'))
+        scene.write_text(
+            bowl_scene.read_text().replace(
+                '<integer name="resolution" value="20"/>', '<string name="filename" value="ball.npz"/>'
+            )
+        )
         found.append(fingerprint(load_fit_scene(scene, bowl_scene.with_suffix("")), TetLattice(20)))
     assert found[0] != found[1]
     assert found[0] | {"fields": ""} == found[1] | {"fields": ""}
@@ -36,12 +39,15 @@ def test_given_fields_belong_to_it(bowl_scene, tmp_path):
         check_fingerprint(*found)
 
 
-@pytest.mark.parametrize(("changes", "words"), [
-    ({"lattice": "tet, 24 cells"}, "(lattice: tet, 24 cells instead of tet, 20 cells); resume with"),
-    ({"light": "x", "material": "y"}, "(material of the gshell shape, initial light); resume"),
-    ({"targets": {}}, "(images of 'view_000', 'view_001', 'view_002' ...); resume"),
-    ({"views": {}}, "(0 views instead of 12: "),
-])
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"lattice": "tet, 24 cells"}, "(lattice: tet, 24 cells instead of tet, 20 cells); resume with"),
+        ({"light": "x", "material": "y"}, "(material of the gshell shape, initial light); resume"),
+        ({"targets": {}}, "(images of 'view_000', 'view_001', 'view_002' ...); resume"),
+        ({"views": {}}, "(0 views instead of 12: "),
+    ],
+)
 def test_it_says_what_differs(found, changes, words):
     with pytest.raises(UserError) as told:
         check_fingerprint(found | changes, found)

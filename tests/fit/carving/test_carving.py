@@ -29,8 +29,9 @@ def trained():
     def run(shape, **fields):
         if shape not in volumes:
             fit = fit_of(subject, shape())
-            volume = RadianceVolume(hull, vertices, faces, subject.to_world, fit.views, fit.training,
-                                    CONFIG.cavities)
+            volume = RadianceVolume(
+                hull, vertices, faces, subject.to_world, fit.views, fit.training, CONFIG.cavities
+            )
             for step in range(CONFIG.cavities.iterations):
                 volume.step(step)
             volumes[shape] = fit, volume

@@ -29,7 +29,7 @@ def test_a_slot_is_hollowed_out(depth):
     distance = hollows(HULL, CLOSED, opacity, seen)
     # Along the slot's middle the sign changes between its last solid vertex and its first empty one.
     last = int(RADIUS - depth + N / 2)
-    below, above = distance[N // 2, last:last + 2, N // 2]
+    below, above = distance[N // 2, last : last + 2, N // 2]
     assert below < 0 < above and below == pytest.approx(-above, abs=0.1)
     hollow = (distance > 0) & (HULL < 0)
     assert (hollow & air).sum() > 0.85 * (air & (HULL < 0)).sum()

@@ -19,8 +19,9 @@ def seen():
 def make(seen, first=0):
     views, pixels, _ = seen
     hull, vertices, faces = hull_of(32)
-    return RadianceVolume(hull, vertices, faces, mi.ScalarTransform4f(), views, pixels, CONFIG.cavities,
-                          first)
+    return RadianceVolume(
+        hull, vertices, faces, mi.ScalarTransform4f(), views, pixels, CONFIG.cavities, first
+    )
 
 
 def march(volume, rays, **options):
@@ -30,8 +31,9 @@ def march(volume, rays, **options):
 def test_no_ray_meets_the_hull(seen):
     views, pixels, _ = seen
     hull, vertices, faces = hull_of(32)
-    volume = RadianceVolume(hull, vertices + 50, faces, mi.ScalarTransform4f(), views, pixels,
-                            CONFIG.cavities)
+    volume = RadianceVolume(
+        hull, vertices + 50, faces, mi.ScalarTransform4f(), views, pixels, CONFIG.cavities
+    )
     before = volume.opacity()
     assert np.isfinite(list(volume.step(0).values())).all()
     np.testing.assert_array_equal(volume.opacity(), before)
@@ -44,7 +46,7 @@ def test_even_fog_absorbs_exponentially(seen):
     origin = mi.Point3f(0, 0, -0.3)
     rays = origin, mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0.6)
     radiance, transmittance = march(volume, rays)
-    depth = np.log1p(np.exp(radiance_volume._FOG))          # of a cell
+    depth = np.log1p(np.exp(radiance_volume._FOG))  # of a cell
     steps = np.ceil(0.6 / (0.5 * 2 / volume.resolution))
     assert transmittance[0] == pytest.approx(np.exp(-0.5 * steps * depth), rel=1e-3)
     assert radiance.x[0] == pytest.approx(volume.mean_radiance * (1 - transmittance[0]), rel=1e-3)
@@ -59,21 +61,24 @@ def test_replay_gives_the_derivative(seen):
     radiance, transmittance = march(volume, rays)
     by_radiance = mi.Color3f(generator.normal(size=(3, dr.width(transmittance))))
     by_transmittance = mi.Float(generator.normal(size=dr.width(transmittance)))
-    gradient = dr.unravel(mi.Vector4f, march(volume, rays, adjoint=(radiance, transmittance, by_radiance,
-                                                                    by_transmittance)))
+    gradient = dr.unravel(
+        mi.Vector4f, march(volume, rays, adjoint=(radiance, transmittance, by_radiance, by_transmittance))
+    )
     inside = volume._allowed.numpy()
     base = {name: optimizer[name].numpy().astype(np.float64) for name in ("density", "radiance")}
     slope = inside / (1 + np.exp(-base["density"]))
     towards = {name: 1 + generator.uniform(size=len(value)) for name, value in base.items()}
     expected = (slope * towards["density"] * gradient.w.numpy()).sum() + (
-        towards["radiance"].reshape(-1, 3) * gradient.numpy()[:3].T).sum()
+        towards["radiance"].reshape(-1, 3) * gradient.numpy()[:3].T
+    ).sum()
 
     def loss(t):
         for name, value in base.items():
             optimizer[name] = mi.Float((value + t * towards[name]).astype(np.float32))
         radiance, transmittance = march(volume, rays)
         return (radiance.numpy().astype(np.float64) * by_radiance.numpy()).sum() + (
-            transmittance.numpy().astype(np.float64) * by_transmittance.numpy()).sum()
+            transmittance.numpy().astype(np.float64) * by_transmittance.numpy()
+        ).sum()
 
     step = 0.01
     assert expected == pytest.approx((loss(step) - loss(-step)) / (2 * step), rel=0.02)

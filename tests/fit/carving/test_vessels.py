@@ -24,8 +24,10 @@ def box_of_cloth() -> trimesh.Trimesh:
 
 def beside_each_other(first: trimesh.Trimesh, second: trimesh.Trimesh) -> trimesh.Trimesh:
     """Both at half the size."""
-    moved = [shape.copy().apply_scale(0.5).apply_translation([x, 0, 0])
-             for shape, x in ((first, -0.5), (second, 0.5))]
+    moved = [
+        shape.copy().apply_scale(0.5).apply_translation([x, 0, 0])
+        for shape, x in ((first, -0.5), (second, 0.5))
+    ]
     return trimesh.util.concatenate(moved)
 
 
@@ -91,9 +93,12 @@ def test_only_the_cups_opening_goes_where_there_is_another():
     half, wall = 0.5 * HALF, 0.5 * WALL
 
     def both(points):
-        return (np.minimum(block_distance(points, half, -0.5), block_distance(points, half, 0.5)),
-                np.minimum(opened_from_above(points, half, wall, -0.5),
-                           opened_from_above(points, half, wall, 0.5)))
+        return (
+            np.minimum(block_distance(points, half, -0.5), block_distance(points, half, 0.5)),
+            np.minimum(
+                opened_from_above(points, half, wall, -0.5), opened_from_above(points, half, wall, 0.5)
+            ),
+        )
 
     found = vessels(beside_each_other(cup(), box_of_cloth()), both, resolution=48)
     assert found.solid[found.vertices[:, 0] < 0].all()

@@ -10,8 +10,16 @@ STOP = np.log(2)
 PRIOR = STOP / 3
 
 
-def sightings(stops: np.ndarray, *, gloss: float = 0.0, look: float = 0.0, flat: float = 0.0,
-              overlap: bool = True, lit: float = 0.0, seed: int = 0) -> Observations:
+def sightings(
+    stops: np.ndarray,
+    *,
+    gloss: float = 0.0,
+    look: float = 0.0,
+    flat: float = 0.0,
+    overlap: bool = True,
+    lit: float = 0.0,
+    seed: int = 0,
+) -> Observations:
     """Of a ball by views around it, noisy.
 
     Args:
@@ -23,8 +31,10 @@ def sightings(stops: np.ndarray, *, gloss: float = 0.0, look: float = 0.0, flat:
         lit: how much darker what only the second half sees is.
     """
     rng, views, places = np.random.default_rng(seed), len(stops), 300
-    normal, toward = (array / np.linalg.norm(array, axis=1, keepdims=True)
-                      for array in (rng.normal(size=(places, 3)), rng.normal(size=(views, 3))))
+    normal, toward = (
+        array / np.linalg.norm(array, axis=1, keepdims=True)
+        for array in (rng.normal(size=(places, 3)), rng.normal(size=(views, 3)))
+    )
     side = np.zeros(places)
     if not overlap:
         side = np.arange(places) % 2
@@ -32,7 +42,7 @@ def sightings(stops: np.ndarray, *, gloss: float = 0.0, look: float = 0.0, flat:
     if not overlap:
         sees &= side == (np.arange(views) >= views // 2)[:, None]
     view, place = np.nonzero(sees)
-    mirrored = (2 * (toward[view] * normal[place]).sum(axis=1, keepdims=True) * normal[place] - toward[view])
+    mirrored = 2 * (toward[view] * normal[place]).sum(axis=1, keepdims=True) * normal[place] - toward[view]
     color = rng.normal(0, 0.5, (places, 3)) - lit * side[:, None]
     seen = color[place] + STOP * stops[view] + 0.05 * rng.normal(size=(len(view), 3))
     seen += gloss * (np.exp(8 * (mirrored @ [0.6, 0.6, 0.5] - 1)) + mirrored @ [0.3, 0.8, -0.2])[:, None]
@@ -41,8 +51,9 @@ def sightings(stops: np.ndarray, *, gloss: float = 0.0, look: float = 0.0, flat:
     bright /= np.linalg.norm(bright, axis=1, keepdims=True)
     seen += flat * np.exp((toward[view] @ bright.T - 1) / np.radians(20) ** 2).sum(axis=1, keepdims=True)
     region = (normal > 0) @ np.array([4, 2, 1])
-    return Observations(views, place, view, region[place], seen, np.ones_like(seen), normal[place], mirrored,
-                        toward[view])
+    return Observations(
+        views, place, view, region[place], seen, np.ones_like(seen), normal[place], mirrored, toward[view]
+    )
 
 
 def exposed(views: int, size: float, seed: int = 1) -> np.ndarray:

@@ -55,14 +55,17 @@ def test_places_beside_outlines_and_of_what_is_unknown_are_left_out(scene, bowl)
     half[:, : half.shape[1] // 2] = 1
     targets = [dataclasses.replace(target, known=half) for target in scene.targets]
     assert 0.2 < len(look(scene, bowl, targets)) / len(everything) < 0.6
-    shrunk = [dataclasses.replace(target, rgba=np.where(target.rgba[..., 3:] < COVERED, 0, target.rgba))
-              for target in scene.targets]
+    shrunk = [
+        dataclasses.replace(target, rgba=np.where(target.rgba[..., 3:] < COVERED, 0, target.rgba))
+        for target in scene.targets
+    ]
     assert len(look(scene, bowl, shrunk)) == len(everything)
 
 
 def test_what_a_photograph_clips_is_left_out(scene, bowl):
-    bright = [dataclasses.replace(target, rgba=target.rgba * np.float32([2, 2, 2, 1]))
-              for target in scene.targets]
+    bright = [
+        dataclasses.replace(target, rgba=target.rgba * np.float32([2, 2, 2, 1])) for target in scene.targets
+    ]
     clipped = [dataclasses.replace(target, rgba=np.minimum(target.rgba, 1)) for target in bright]
     seen = look(scene, bowl, clipped)
     assert len(seen) < 0.7 * len(look(scene, bowl, bright))
@@ -86,8 +89,10 @@ def test_what_hides_a_place(scene, bowl):
     vertices, faces = bowl
     y = -0.3 * RADIUS
     corners = np.array([[-1, y, -1], [1, y, -1], [1, y, 1], [-1, y, 1]]) * [0.5, 1, 0.5]
-    both = np.concatenate([vertices, corners]), np.concatenate(
-        [faces, np.array([[0, 2, 1], [0, 3, 2]]) + len(vertices)])
+    both = (
+        np.concatenate([vertices, corners]),
+        np.concatenate([faces, np.array([[0, 2, 1], [0, 3, 2]]) + len(vertices)]),
+    )
     views = PinholeViews.from_sensors(scene.sensors)
     seen = observe(both, views, scene.targets, places=10**6, cell=CELL)
     above = int(np.argmax(views.origins[:, 1]))

@@ -32,14 +32,34 @@ def _grey(at: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def capture():
-    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"},
-            "pixel_format": "rgba"}
+    film = {
+        "type": "hdrfilm",
+        "width": SIZE,
+        "height": SIZE,
+        "rfilter": {"type": "box"},
+        "pixel_format": "rgba",
+    }
     look_at = mi.ScalarTransform4f().look_at
-    sensors = [mi.load_dict({"type": "perspective", "fov": 40, "film": film,
-                             "to_world": look_at([x, y, 3], [0, 0, 0], [0, 1, 0])})
-               for x in (-1, 0, 1) for y in (-1, 0, 1)]
-    scene = mi.load_dict({"type": "scene", "subject": _plate(_checks).shape(), **LIGHT,
-                          "integrator": {"type": "path", "max_depth": 5, "hide_emitters": True}})
+    sensors = [
+        mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": 40,
+                "film": film,
+                "to_world": look_at([x, y, 3], [0, 0, 0], [0, 1, 0]),
+            }
+        )
+        for x in (-1, 0, 1)
+        for y in (-1, 0, 1)
+    ]
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "subject": _plate(_checks).shape(),
+            **LIGHT,
+            "integrator": {"type": "path", "max_depth": 5, "hide_emitters": True},
+        }
+    )
     targets = [Target(None, np.array(mi.render(scene, sensor=sensor, spp=64)), True) for sensor in sensors]
     return sensors, PinholeViews.from_sensors(sensors), targets
 

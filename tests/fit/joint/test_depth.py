@@ -81,12 +81,15 @@ def test_equal_channels_are_one(tmp_path):
     assert load_depth(tmp_path / "a.depth.exr", 6, 4).shape == (4, 6)
 
 
-@pytest.mark.parametrize(("pixels", "told"), [
-    (np.full((4, 5), 2.0), "is 5 x 4 pixels, but its sensor's film is 6 x 4"),
-    (np.full((4, 6), -2.0), "negative distances"),
-    (np.zeros((4, 6)), "holds no distance"),
-    (np.arange(72).reshape(4, 6, 3), "3 different channels"),
-])
+@pytest.mark.parametrize(
+    ("pixels", "told"),
+    [
+        (np.full((4, 5), 2.0), "is 5 x 4 pixels, but its sensor's film is 6 x 4"),
+        (np.full((4, 6), -2.0), "negative distances"),
+        (np.zeros((4, 6)), "holds no distance"),
+        (np.arange(72).reshape(4, 6, 3), "3 different channels"),
+    ],
+)
 def test_mistakes(tmp_path, pixels, told):
     write(tmp_path / "a.depth.exr", pixels)
     with pytest.raises(UserError, match=told):

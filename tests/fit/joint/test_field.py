@@ -29,9 +29,10 @@ def scene(tmp_path_factory):
     fields = LatticeFields(sdf, (0.02 - points[:, 1]).astype(np.float32), np.zeros(3 * len(sdf), np.float32))
     fields.save(folder / "start.npz")
     xml = path.read_text()
-    shape = xml[xml.index("<shape"):xml.index("</shape>")]
-    path.write_text(xml.replace(shape, '<shape type="gshell" id="subject">'
-                                       '<string name="filename" value="start.npz"/>'))
+    shape = xml[xml.index("<shape") : xml.index("</shape>")]
+    path.write_text(
+        xml.replace(shape, '<shape type="gshell" id="subject"><string name="filename" value="start.npz"/>')
+    )
     return path
 
 
@@ -43,8 +44,20 @@ def short_fits(monkeypatch):
 
 
 def fit(scene, output, field, *arguments):
-    return main([str(scene), "-o", str(output), "--quiet", *SHORT, "--joint.warmup", "0", "--model.field",
-                 field, *arguments])
+    return main(
+        [
+            str(scene),
+            "-o",
+            str(output),
+            "--quiet",
+            *SHORT,
+            "--joint.warmup",
+            "0",
+            "--model.field",
+            field,
+            *arguments,
+        ]
+    )
 
 
 def log(output):
@@ -86,7 +99,8 @@ def test_a_network_goes_on_as_if_nothing_had_been(scene, tmp_path, monkeypatch):
     stop_at(5, JointStage, "step")
     assert fit(scene, stopped, "hashgrid", "--checkpoint-seconds", "0", "--resume") == 0
     assert [(step["stage"], step["iteration"]) for step in log(stopped)] == [
-        (step["stage"], step["iteration"]) for step in log(whole)]
+        (step["stage"], step["iteration"]) for step in log(whole)
+    ]
     meshes = [trimesh.load(folder / "mesh.ply", process=False) for folder in (whole, stopped)]
     assert abs(len(meshes[0].vertices) - len(meshes[1].vertices)) < 20
     # Equal runs differ by 0.3 %, as additions have no fixed order; without the optimiser's state it is 1 %.

@@ -16,17 +16,36 @@ from gshell_mi.lattice import make_lattice
 from gshell_mi.scene import load_fit_scene
 
 #: Losses over the surface, whose size changes, that the defaults leave out.
-LOSSES = {"hole_opening": 1e-3, "hole_closing": 1e-3, "sdf_sign": 1e-3, "eikonal": 1e-3,
-          "template_smoothness": 1e-3}
-CONFIG = FitConfig(iterations=100).changed({"lattice.band_resolution": 99,
-    "joint.warmup": 0.0, "joint.geometry_lr": 0.6, "render.views": 2, "render.spp": 2, "render.primal_spp": 2,
-    "model.light_height": 8})
+LOSSES = {
+    "hole_opening": 1e-3,
+    "hole_closing": 1e-3,
+    "sdf_sign": 1e-3,
+    "eikonal": 1e-3,
+    "template_smoothness": 1e-3,
+}
+CONFIG = FitConfig(iterations=100).changed(
+    {
+        "lattice.band_resolution": 99,
+        "joint.warmup": 0.0,
+        "joint.geometry_lr": 0.6,
+        "render.views": 2,
+        "render.spp": 2,
+        "render.primal_spp": 2,
+        "model.light_height": 8,
+    }
+)
 
 
-@pytest.mark.parametrize(("grid", "settings"),
-                         [("flexicubes", {}), ("tet", {}), ("flexicubes", {"losses.extra": LOSSES}),
-                          ("flexicubes", {"render.reparam_depth": 2})],
-                         ids=["flexicubes", "tet", "losses", "shadows"])
+@pytest.mark.parametrize(
+    ("grid", "settings"),
+    [
+        ("flexicubes", {}),
+        ("tet", {}),
+        ("flexicubes", {"losses.extra": LOSSES}),
+        ("flexicubes", {"render.reparam_depth": 2}),
+    ],
+    ids=["flexicubes", "tet", "losses", "shadows"],
+)
 def test_a_step_compiles_nothing(bowl_scene, grid, settings):
     lattice, config = make_lattice(grid, 18), CONFIG.changed(settings)
     fit = load_fit_scene(bowl_scene)

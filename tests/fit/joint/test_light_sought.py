@@ -19,15 +19,25 @@ from gshell_mi.scene import load_fit_scene
 
 LATTICE = TetLattice(12)
 SUN = np.array([0.6, 0.64, 0.48])
-CONFIG = FitConfig(iterations=60).changed({"lattice.band_resolution": 99,
-    "joint.warmup": 1.0, "render.spp": 4, "render.primal_spp": 4, "render.max_depth": 2,
-    "model.light_height": 8})
+CONFIG = FitConfig(iterations=60).changed(
+    {
+        "lattice.band_resolution": 99,
+        "joint.warmup": 1.0,
+        "render.spp": 4,
+        "render.primal_spp": 4,
+        "render.max_depth": 2,
+        "model.light_height": 8,
+    }
+)
 
 
 def directions(height: int) -> np.ndarray:
     """(height, 2 height, 3) directions of an envmap's texels."""
-    polar, turn = np.meshgrid((np.arange(height) + 0.5) * np.pi / height,
-                              (np.arange(2 * height) + 0.5) * np.pi / height, indexing="ij")
+    polar, turn = np.meshgrid(
+        (np.arange(height) + 0.5) * np.pi / height,
+        (np.arange(2 * height) + 0.5) * np.pi / height,
+        indexing="ij",
+    )
     return np.stack([np.sin(polar) * np.sin(turn), np.cos(polar), -np.sin(polar) * np.cos(turn)], axis=-1)
 
 
@@ -55,8 +65,11 @@ def fit(tmp_path_factory):
     path = mi.load_dict({"type": "path", "hide_emitters": True})
     (folder / "ball").mkdir()
     for sensor in truth.sensors():
-        mi.util.write_bitmap(str(folder / "ball" / f"{sensor.id()}.exr"),
-                             mi.render(truth, sensor=sensor, integrator=path, spp=256), write_async=False)
+        mi.util.write_bitmap(
+            str(folder / "ball" / f"{sensor.id()}.exr"),
+            mi.render(truth, sensor=sensor, integrator=path, spp=256),
+            write_async=False,
+        )
     return load_fit_scene(folder / "ball.xml")
 
 
@@ -66,8 +79,10 @@ def seen() -> Surface:
     points = LATTICE.vertex_positions()
     lit = 0.1 + np.maximum(points @ SUN, 0) / np.linalg.norm(points + 1e-9, axis=1)
     light = np.float32(np.median(lit) / TYPICAL_REFLECTANCE)
-    return Surface(sphere(LATTICE, RADIUS), seen=Seen(np.repeat(lit[:, None], 3, axis=1),
-                                                      np.full(len(points), True), light))
+    return Surface(
+        sphere(LATTICE, RADIUS),
+        seen=Seen(np.repeat(lit[:, None], 3, axis=1), np.full(len(points), True), light),
+    )
 
 
 def start(fit, seen, config: FitConfig) -> JointStage:
@@ -89,14 +104,18 @@ def test_or_with_what_was_seen(fit, seen, settings):
 
 def test_the_light_moves_first(fit, seen):
     joint = start(fit, seen, CONFIG.changed({"iterations": 10, "joint.color_hold": 0.8}))
-    sought = ((joint.material_optimizer, "vertex_color"), (joint.material_optimizer, "vertex_roughness"),
-              (joint.light_optimizer, "log_radiance"))
+    sought = (
+        (joint.material_optimizer, "vertex_color"),
+        (joint.material_optimizer, "vertex_roughness"),
+        (joint.light_optimizer, "log_radiance"),
+    )
     values = [[optimizer[name].numpy() for optimizer, name in sought]]
     for iteration in range(8):
         joint.step(iteration)
         values.append([optimizer[name].numpy() for optimizer, name in sought])
-    color, roughness, light = ([np.abs(after[i] - before[i]).max() for before, after in pairwise(values)]
-                               for i in range(3))
+    color, roughness, light = (
+        [np.abs(after[i] - before[i]).max() for before, after in pairwise(values)] for i in range(3)
+    )
     assert color[0] == 0 and light[0] == pytest.approx(CONFIG.joint.light_lr, rel=1e-3)
     assert color[7] > 5 * color[1]
     assert roughness[0] == pytest.approx(CONFIG.joint.material_lr, rel=1e-3)

@@ -17,9 +17,17 @@ from gshell_mi.material import MaterialField
 from gshell_mi.scene import load_fit_scene
 
 #: The joint stage's own weights, all 0.
-NONE = FitConfig(iterations=4).changed({
-    "losses.material_smoothness": 0.0, "losses.light_grey": 0.0, "losses.flexicubes_deviation": 0.0,
-    "render.spp": 1, "render.primal_spp": 1, "render.max_depth": 2, "model.light_height": 4})
+NONE = FitConfig(iterations=4).changed(
+    {
+        "losses.material_smoothness": 0.0,
+        "losses.light_grey": 0.0,
+        "losses.flexicubes_deviation": 0.0,
+        "render.spp": 1,
+        "render.primal_spp": 1,
+        "render.max_depth": 2,
+        "model.light_height": 4,
+    }
+)
 
 
 @pytest.fixture(scope="module")

@@ -42,10 +42,17 @@ def views() -> PinholeViews:
     for index in range(VIEWS):
         origin = rng.normal(size=3)
         origin *= DISTANCE / np.linalg.norm(origin)
-        sensors.append(mi.load_dict({
-            "type": "perspective", "id": f"view_{index:03}", "fov": 32.0,
-            "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 1, 0.1]),
-            "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE}}))
+        sensors.append(
+            mi.load_dict(
+                {
+                    "type": "perspective",
+                    "id": f"view_{index:03}",
+                    "fov": 32.0,
+                    "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 1, 0.1]),
+                    "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE},
+                }
+            )
+        )
     return PinholeViews.from_sensors(sensors)
 
 
@@ -53,7 +60,7 @@ def photograph(mesh, views: PinholeViews, *, textured: bool = True) -> list[Targ
     """What exact cameras see, antialiased."""
     scene, targets = mesh_scene(*mesh), []
     for view in range(len(views)):
-        row, column = np.mgrid[:SIZE * OVER, :SIZE * OVER].reshape(2, -1)
+        row, column = np.mgrid[: SIZE * OVER, : SIZE * OVER].reshape(2, -1)
         film = (np.stack([column, row]) + 0.5) / (SIZE * OVER)
         index = mi.UInt32(np.full(film.shape[1], view, np.uint32))
         ray = views.rays(index, mi.Point2f(film.astype(np.float32)))
@@ -131,7 +138,7 @@ def test_what_is_unknown_tells_nothing(mesh, views, targets):
     spoilt = []
     for target in targets:
         rgba, known = target.rgba.copy(), np.ones((SIZE, SIZE), np.float32)
-        rgba[:, :SIZE // 2], known[:, :SIZE // 2] = [0.9, 0.1, 0.9, 1.0], 0
+        rgba[:, : SIZE // 2], known[:, : SIZE // 2] = [0.9, 0.1, 0.9, 1.0], 0
         spoilt.append(Target(target.path, rgba, True, known=known))
     given = wrong(views, 0.5)
     alignment, _ = aligned(mesh, spoilt, given)

@@ -13,13 +13,30 @@ def sensor(index: int, kind: str = "perspective") -> mi.Sensor:
     rng = np.random.default_rng(index)
     origin = rng.normal(size=3)
     origin *= 3 / np.linalg.norm(origin)
-    optics = {"aperture_radius": 0.01, "focus_distance": 3.0} if kind == "thinlens" else {
-        "principal_point_offset_x": 0.1, "principal_point_offset_y": -0.05}
-    return mi.load_dict({
-        "type": kind, "id": f"view_{index:03}", "fov": 35.0, "fov_axis": "y", **optics,
-        "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 1, 0]),
-        "film": {"type": "hdrfilm", "width": 60, "height": 40, "crop_width": 50, "crop_height": 30,
-                 "crop_offset_x": 3, "crop_offset_y": 7}})
+    optics = (
+        {"aperture_radius": 0.01, "focus_distance": 3.0}
+        if kind == "thinlens"
+        else {"principal_point_offset_x": 0.1, "principal_point_offset_y": -0.05}
+    )
+    return mi.load_dict(
+        {
+            "type": kind,
+            "id": f"view_{index:03}",
+            "fov": 35.0,
+            "fov_axis": "y",
+            **optics,
+            "to_world": mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 1, 0]),
+            "film": {
+                "type": "hdrfilm",
+                "width": 60,
+                "height": 40,
+                "crop_width": 50,
+                "crop_height": 30,
+                "crop_offset_x": 3,
+                "crop_offset_y": 7,
+            },
+        }
+    )
 
 
 def corrections(count: int, size: float = 0.02, seed: int = 1) -> Corrections:
@@ -47,8 +64,10 @@ def test_a_similarity_of_all_cameras_is_no_correction():
     np.testing.assert_allclose(left.to_array(), 0, atol=1e-9)
     # Together with corrections of their own nothing else is left of it.
     own = corrections(6).as_given(views)
-    both = Corrections((turn * Rotation.from_rotvec(own.rotations)).as_rotvec(),
-                       1.07 * turn.apply(views.origins + own.shifts - middle) + middle - views.origins)
+    both = Corrections(
+        (turn * Rotation.from_rotvec(own.rotations)).as_rotvec(),
+        1.07 * turn.apply(views.origins + own.shifts - middle) + middle - views.origins,
+    )
     np.testing.assert_allclose(both.as_given(views).to_array(), own.to_array(), atol=1e-9)
 
 
@@ -60,9 +79,18 @@ def test_one_camera_stays_where_it_is():
 def test_movement_in_pixels():
     """A camera that turns by a small angle moves the middle of its image by f times that."""
     to_world = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
-    views = PinholeViews.from_sensors([mi.load_dict({
-        "type": "perspective", "fov": 40.0, "to_world": to_world,
-        "film": {"type": "hdrfilm", "width": 200, "height": 200}})])
+    views = PinholeViews.from_sensors(
+        [
+            mi.load_dict(
+                {
+                    "type": "perspective",
+                    "fov": 40.0,
+                    "to_world": to_world,
+                    "film": {"type": "hdrfilm", "width": 200, "height": 200},
+                }
+            )
+        ]
+    )
     change = Corrections(np.array([[0, 1e-3, 0]]), np.zeros((1, 3)))
     focal = 100 / np.tan(np.radians(20))
     assert change.in_pixels(views, np.zeros((1, 3)))[0] == pytest.approx(1e-3 * focal, rel=1e-3)

@@ -91,8 +91,9 @@ def test_what_a_neck_joins_is_judged_apart(ball):
     neck = (np.abs(y) < 0.07) & (x > 0) & (z > 0)
     opened = up | side | neck
     assert len(np.unique(equal_patches(opened, ball.faces)[opened])) == 1
-    result, _ = _closed(ball, np.where(opened, -1.0, 1.0),
-                        lambda opaque: np.where(opaque, 1.0, np.where(side, 2.0, 0.1)))
+    result, _ = _closed(
+        ball, np.where(opened, -1.0, 1.0), lambda opaque: np.where(opaque, 1.0, np.where(side, 2.0, 0.1))
+    )
     assert (result[up] < 0).all() and (result[side] > 0).all()
 
 

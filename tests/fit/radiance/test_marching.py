@@ -81,9 +81,14 @@ def test_derivatives_are_those_of_finite_differences(width):
 
     result = seen(packets)
     count = dr.width(result.transmittance)
-    adjoint = Adjoint(result.radiance, result.transmittance, result.spread,
-                      mi.Color3f(*(dr.full(mi.Float, c[0], count) for c in by_radiance)),
-                      dr.full(mi.Float, by_transmittance[0], count), mi.Float(weight))
+    adjoint = Adjoint(
+        result.radiance,
+        result.transmittance,
+        result.spread,
+        mi.Color3f(*(dr.full(mi.Float, c[0], count) for c in by_radiance)),
+        dr.full(mi.Float, by_transmittance[0], count),
+        mi.Float(weight),
+    )
     gradient = composite(bricks, mi.Float(packets.ravel()), rays, 5, adjoint=adjoint).numpy()
     rng = np.random.default_rng(1)
     for _ in range(3):

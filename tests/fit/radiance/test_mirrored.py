@@ -43,8 +43,10 @@ def test_it_is_found_from_rays():
 
 def test_colors_that_do_not_depend_on_the_direction_mirror_nothing():
     rng = np.random.default_rng(3)
-    color, noise = (mi.Color3f(rng.uniform(low, high, (3, 20000)).astype(np.float32))
-                    for low, high in ((0.2, 0.8), (0.9, 1.1)))
+    color, noise = (
+        mi.Color3f(rng.uniform(low, high, (3, 20000)).astype(np.float32))
+        for low, high in ((0.2, 0.8), (0.9, 1.1))
+    )
     found = Mirrored.nothing().improved([(_directions(20000, 4), color * noise, color)])
     assert np.abs(found.coefficients).max() < 0.01
 
@@ -60,9 +62,17 @@ CONFIG = RefinementConfig(iterations=80, smoothing=6.3, detail=3.1, lr=0.2)
 def cameras() -> list[mi.Sensor]:
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     look_at = mi.ScalarTransform4f().look_at
-    return [mi.load_dict({"type": "perspective", "fov": 35, "film": film,
-                          "to_world": look_at((3 * d).tolist(), [0, 0, 0], [0.1, 1, 0.2])})
-            for d in trimesh.creation.icosphere(subdivisions=1).vertices]
+    return [
+        mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": 35,
+                "film": film,
+                "to_world": look_at((3 * d).tolist(), [0, 0, 0], [0.1, 1, 0.2]),
+            }
+        )
+        for d in trimesh.creation.icosphere(subdivisions=1).vertices
+    ]
 
 
 def glossy_sphere() -> tuple[PinholeViews, list[Target]]:
@@ -93,8 +103,9 @@ def test_highlights_pull_the_surface_inwards_far_less():
     offsets = {}
     shown = Shown((vertices, faces), views, [(pixels, pixels)], batch=16384, seed=0)
     for known in (False, True):
-        appearance = SurfaceRadiance(vertices, faces, views, pixels, RADIANCE,
-                                     mirrored=shown.mirrored if known else None)
+        appearance = SurfaceRadiance(
+            vertices, faces, views, pixels, RADIANCE, mirrored=shown.mirrored if known else None
+        )
         for _ in range(3):
             appearance.refit(np.ones(len(vertices), bool))
         refinement = PhotometricRefinement(appearance, vertices, faces, None, CELL, CONFIG)
@@ -113,6 +124,7 @@ def test_the_judge_takes_no_polished_place_for_a_window():
     window = vertices @ [1, 0, 0] > 0.75 * RADIUS
     judge = Judge(views, targets, Judge.halves(len(views)), batch=16384)
     opened = positive_part(vertices, faces, np.where(window, -1.0, 1.0))
-    verdict = judge.compare(judge.shown((vertices, faces)).whole, judge.shown(opened).whole,
-                            np.where(window, 0, -1))
+    verdict = judge.compare(
+        judge.shown((vertices, faces)).whole, judge.shown(opened).whole, np.where(window, 0, -1)
+    )
     assert (verdict.gain < -2 * verdict.noise).tolist() == [True]

@@ -30,8 +30,10 @@ def closed(judge, template):
 
 def _values(ball, *directions):
     """Negative in caps around some directions, by the distance from their rims."""
-    return np.min([np.arccos(np.clip(ball.vertices @ np.array(direction), -1, 1)) - 0.6
-                   for direction in directions], axis=0)
+    return np.min(
+        [np.arccos(np.clip(ball.vertices @ np.array(direction), -1, 1)) - 0.6 for direction in directions],
+        axis=0,
+    )
 
 
 def test_rays_meet_a_part_where_they_meet_its_mesh(ball, judge, template, closed):
@@ -61,8 +63,9 @@ def test_a_part_is_judged_as_its_mesh_is(ball, judge, template, closed):
 
 
 def test_what_is_the_same_is_judged_the_same(ball, judge, closed):
-    verdict = judge.compare(closed.whole, closed.part(np.ones(len(ball.vertices))),
-                            np.zeros(len(ball.vertices), int))
+    verdict = judge.compare(
+        closed.whole, closed.part(np.ones(len(ball.vertices))), np.zeros(len(ball.vertices), int)
+    )
     assert verdict.gain == pytest.approx(0, abs=1e-5) and not verdict.accepted
 
 

@@ -34,8 +34,15 @@ def _volume(scene: FitScene, config: VolumeConfig = CONFIG, stored=None) -> Radi
     alphas = [target.rgba[..., 3] for target in scene.targets]
     hull = visual_hull(mi.Point3f(x, y, z), views, alphas).numpy().reshape((side,) * 3)
     surface = np.zeros((1, 3), np.float32), np.zeros((0, 3), np.uint32)
-    return RadianceVolume(np.clip(hull, -1, 1), scene.subject.to_world, views,
-                          PixelPool(views, scene.targets), config, surface, stored)
+    return RadianceVolume(
+        np.clip(hull, -1, 1),
+        scene.subject.to_world,
+        views,
+        PixelPool(views, scene.targets),
+        config,
+        surface,
+        stored,
+    )
 
 
 @pytest.fixture(scope="module")

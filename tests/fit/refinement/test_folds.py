@@ -42,8 +42,11 @@ def test_metrics_say_whether_it_was_kept(bowl_scene, tmp_path, decisions, kept):
     assert steps(tmp_path) == rounds(2, 4) and metrics["seconds"]["folds"] > 0
 
 
-@pytest.mark.parametrize(("first", "arguments"), [(False, ()), (True, ("--folds.iterations", "0"))],
-                         ids=["first round dropped", "off"])
+@pytest.mark.parametrize(
+    ("first", "arguments"),
+    [(False, ()), (True, ("--folds.iterations", "0"))],
+    ids=["first round dropped", "off"],
+)
 def test_there_may_be_none(bowl_scene, tmp_path, decisions, first, arguments):
     decisions(first)
     assert "folds_kept" not in run(bowl_scene, tmp_path, *arguments)

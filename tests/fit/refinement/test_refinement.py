@@ -26,9 +26,17 @@ def cameras() -> list[mi.Sensor]:
     directions = trimesh.creation.icosphere(subdivisions=1).vertices[::2]
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     look_at = mi.ScalarTransform4f().look_at
-    return [mi.load_dict({"type": "perspective", "fov": 35, "film": film,
-                          "to_world": look_at((3 * d).tolist(), [0, 0, 0], [0.1, 1, 0.2])})
-            for d in directions]
+    return [
+        mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": 35,
+                "film": film,
+                "to_world": look_at((3 * d).tolist(), [0, 0, 0], [0.1, 1, 0.2]),
+            }
+        )
+        for d in directions
+    ]
 
 
 def pattern(point: mi.Point3f) -> mi.Color3f:
@@ -114,11 +122,19 @@ def test_outlines_of_what_is_unknown_are_none(capture):
     for target in targets:
         rgba, known = target.rgba.copy(), np.ones(target.rgba.shape[:2], np.float32)
         # What stands before the sphere hides its edge, by some pixels.
-        rgba[SIZE // 2 + SIZE // 10:], known[SIZE // 2 + SIZE // 10:] = 0, 0
+        rgba[SIZE // 2 + SIZE // 10 :], known[SIZE // 2 + SIZE // 10 :] = 0, 0
         cut.append(Target(None, rgba, True))
         ignored.append(Target(None, rgba, True, known=known))
-    losses = [float(np.sqrt(Outlines(views, each, faces, np.ones(len(vertices), bool)).loss(
-        mi.Float(vertices.ravel()), appearance.scene, np.arange(len(views)))[0])) for each in (cut, ignored)]
+    losses = [
+        float(
+            np.sqrt(
+                Outlines(views, each, faces, np.ones(len(vertices), bool)).loss(
+                    mi.Float(vertices.ravel()), appearance.scene, np.arange(len(views))
+                )[0]
+            )
+        )
+        for each in (cut, ignored)
+    ]
     pixel = 3 * np.linalg.norm(views.bases[0][:, 0]) / SIZE
     assert losses[0] > 0.5 * pixel and losses[1] < 0.3 * pixel
 
@@ -144,8 +160,14 @@ def test_outline_loss_derivative_is_that_of_a_scaled_sphere(capture):
 
 def test_attached_barycentrics():
     positions = mi.Float([0, 0, 0, 1, 0, 0, 0, 1, 0])
-    hit = Sheet(mi.UInt32(0), mi.Point3f(0.25, 0.5, 1), mi.Vector3f(0, 0, -1), mi.Vector3u(0, 1, 2),
-                mi.Vector3f(0.25, 0.25, 0.5), mi.Bool(True))
+    hit = Sheet(
+        mi.UInt32(0),
+        mi.Point3f(0.25, 0.5, 1),
+        mi.Vector3f(0, 0, -1),
+        mi.Vector3u(0, 1, 2),
+        mi.Vector3f(0.25, 0.25, 0.5),
+        mi.Bool(True),
+    )
     dr.enable_grad(positions)
     weights = _barycentric(positions, hit)
     assert np.allclose(dr.detach(weights).numpy().ravel(), [0.25, 0.25, 0.5])

@@ -135,7 +135,8 @@ def test_scores_compare_with_what_was_given(fitted, photographed):
 
 
 def test_kept_exposures(photographed, tmp_path):
-    assert main([str(photographed), "-o", str(tmp_path / "out"), "--quiet", *QUICK,
-                 "--exposures", "keep"]) == 0
+    assert (
+        main([str(photographed), "-o", str(tmp_path / "out"), "--quiet", *QUICK, "--exposures", "keep"]) == 0
+    )
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert "exposures" not in metrics and "exposures_kept" not in metrics

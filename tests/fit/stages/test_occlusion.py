@@ -25,7 +25,7 @@ def hidden(exact) -> np.ndarray:
     """(height, width) what a stand hides in one view."""
     covered = exact.scene.targets[VIEW].rgba[..., 3] > 0.5
     pixels = np.zeros_like(covered)
-    pixels[len(covered) // 2:, COLUMNS] = True
+    pixels[len(covered) // 2 :, COLUMNS] = True
     assert (pixels & covered).sum() > 60
     return pixels
 
@@ -50,8 +50,10 @@ def test_what_a_stand_hides_is_ignored(exact, occluded, hidden):
     assert sum(pixels.sum() for pixels in ignored) < 1.5 * ignored[VIEW].sum()
     assert steps.facts["occluded_views"] >= 1 and max(steps.facts["occlusion_verdict"]["gain"]) > 0
     # The hull that follows is about as large as without the stand, where less is known a little larger.
-    sizes = [int((Hull(fit.config.hull).run(fit, None, Silent()).fields.sdf < 0).sum())
-             for fit in (exact, occluded, occluded.corrected(found))]
+    sizes = [
+        int((Hull(fit.config.hull).run(fit, None, Silent()).fields.sdf < 0).sum())
+        for fit in (exact, occluded, occluded.corrected(found))
+    ]
     assert sizes[1] < 0.9 * sizes[0] and 0.97 * sizes[0] < sizes[2] < 1.3 * sizes[0]
 
 
@@ -92,8 +94,23 @@ def test_a_fit_goes_on_without_what_is_ignored(bowl_scene, tmp_path, monkeypatch
     monkeypatch.setattr(Occlusion, "run", found)
     monkeypatch.setattr(Hull, "run", watched)
     output = tmp_path / "out"
-    assert main([str(bowl_scene), "-o", str(output), "--quiet", *SHORT, *CLOSED, "--iterations", "1",
-                 "--occlusion.most", "0.1"]) == 0
+    assert (
+        main(
+            [
+                str(bowl_scene),
+                "-o",
+                str(output),
+                "--quiet",
+                *SHORT,
+                *CLOSED,
+                "--iterations",
+                "1",
+                "--occlusion.most",
+                "0.1",
+            ]
+        )
+        == 0
+    )
     for known in seen[0]:
         assert (known[:, :24] == 0).all() and (known[:, 24:] == 1).all()
     assert json.loads((output / "metrics.json").read_text())["config"]["occlusion"]["most"] == 0.1
@@ -101,8 +118,10 @@ def test_a_fit_goes_on_without_what_is_ignored(bowl_scene, tmp_path, monkeypatch
 
 def test_masks_that_have_nothing_in_common_are_left_to_the_hull(exact):
     """Half of the masks are empty: there is no hull, and none that disbelieves a tenth."""
-    targets = [dataclasses.replace(target, rgba=target.rgba * np.float32(index % 2))
-               for index, target in enumerate(exact.scene.targets)]
+    targets = [
+        dataclasses.replace(target, rgba=target.rgba * np.float32(index % 2))
+        for index, target in enumerate(exact.scene.targets)
+    ]
     fit = Fit(dataclasses.replace(exact.scene, targets=targets), exact.config, exact.lattices)
     before = start(fit)
     assert Occlusion(FitConfig().occlusion).run(fit, before, Silent()) is before

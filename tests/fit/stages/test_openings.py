@@ -24,8 +24,9 @@ class ScriptedRadiance:
     vertex_count = len(VERTICES)
 
     def __init__(self, first: tuple, false: tuple, behind: tuple):
-        self.false, self.behind = (np.logical_or.reduce([self.cap(axis) for axis in axes], initial=False)
-                                   for axes in (false, behind))
+        self.false, self.behind = (
+            np.logical_or.reduce([self.cap(axis) for axis in axes], initial=False) for axes in (false, behind)
+        )
         self.open = np.logical_or.reduce([self.cap(axis) for axis in first])
         self.rounds = 0
 
@@ -54,16 +55,20 @@ class ScriptedRadiance:
 def found_openings(appearance: ScriptedRadiance, rounds: int = 3) -> np.ndarray:
     clean = partial(clean_opacity, vertices=VERTICES, faces=FACES, min_area=0.005)
     judge = ScriptedJudge(len(VERTICES), appearance.error)
-    return find_openings(appearance, judge.shown((VERTICES, FACES)), judge, rounds, clean,
-                         appearance.train) <= 0
+    return (
+        find_openings(appearance, judge.shown((VERTICES, FACES)), judge, rounds, clean, appearance.train) <= 0
+    )
 
 
-@pytest.mark.parametrize(("false", "behind", "openings", "rounds"), [
-    ((), (), 1, 0),
-    (((0, 1, 0),), (), 1, 1),
-    (((0, 1, 0),), ((1, 0, 0),), 2, 2),
-    (((0, 1, 0),), ((1, 0, 0), (-1, 0, 0)), 3, 2),
-])
+@pytest.mark.parametrize(
+    ("false", "behind", "openings", "rounds"),
+    [
+        ((), (), 1, 0),
+        (((0, 1, 0),), (), 1, 1),
+        (((0, 1, 0),), ((1, 0, 0),), 2, 2),
+        (((0, 1, 0),), ((1, 0, 0), (-1, 0, 0)), 3, 2),
+    ],
+)
 def test_rounds_go_on_as_long_as_they_find_openings(false, behind, openings, rounds):
     appearance = ScriptedRadiance(((0, 0, 1), *false), false, behind)
     opened = found_openings(appearance)

@@ -28,8 +28,9 @@ def bowl(exact) -> Surface:
     fields, scale = exact.scene.subject.fields(), exact.scene.subject.length_scale
     points = fields.lattice.vertex_positions()
     distance = np.linalg.norm(points, axis=1) - RADIUS / scale
-    return Surface(fields).with_fields(sdf=distance.astype(np.float32),
-                                       msdf=(-points[:, 1]).astype(np.float32))
+    return Surface(fields).with_fields(
+        sdf=distance.astype(np.float32), msdf=(-points[:, 1]).astype(np.float32)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +85,20 @@ def test_a_surface_keeps_poses(bowl, errors):
 
 
 #: Hardly any steps.
-QUICK = (*SHORT, *CLOSED, "--iterations", "2", "--cavities.iterations", "0", "--refinement.iterations", "0",
-         "--detail.iterations", "2", "--exposures", "keep")
+QUICK = (
+    *SHORT,
+    *CLOSED,
+    "--iterations",
+    "2",
+    "--cavities.iterations",
+    "0",
+    "--refinement.iterations",
+    "0",
+    "--detail.iterations",
+    "2",
+    "--exposures",
+    "keep",
+)
 
 
 def test_a_fit_exports_the_cameras_that_it_found(bowl_scene, exact, wrong, tmp_path, monkeypatch):
@@ -95,7 +108,7 @@ def test_a_fit_exports_the_cameras_that_it_found(bowl_scene, exact, wrong, tmp_p
     start, end = text.index("<sensor"), text.rindex("</sensor>") + len("</sensor>")
     write_scene(tmp_path / "sensors.xml", exact.scene.light, wrong.scene.sensors)
     moved = (tmp_path / "sensors.xml").read_text()
-    moved = moved[moved.index("<sensor"):moved.rindex("</sensor>") + len("</sensor>")]
+    moved = moved[moved.index("<sensor") : moved.rindex("</sensor>") + len("</sensor>")]
     given.write_text(text[:start] + moved + text[end:])
     output, targets = tmp_path / "out", str(bowl_scene.with_suffix(""))
     command = [str(given), "--targets", targets, "-o", str(output), "--quiet", *QUICK]
@@ -109,6 +122,7 @@ def test_a_fit_exports_the_cameras_that_it_found(bowl_scene, exact, wrong, tmp_p
         raise KeyboardInterrupt
 
     from gshell_mi.fit.stages.texture import Texture
+
     monkeypatch.setattr(Poses, "run", found)
     with monkeypatch.context() as patch:
         patch.setattr(Texture, "run", interrupted)

@@ -17,8 +17,14 @@ from gshell_mi.fit.stages.revision import Revision, _closed
 from gshell_mi.topology import topology
 
 #: Fewer steps and pixels, as so small images need.
-SMALL = {"openings.iterations": 100, "radiance.batch": 16384, "radiance.smoothing": 8.0,
-         "openings.mask": 0.01, "openings.binary": 0.015, "openings.closing": 0.003}
+SMALL = {
+    "openings.iterations": 100,
+    "radiance.batch": 16384,
+    "radiance.smoothing": 8.0,
+    "openings.mask": 0.01,
+    "openings.binary": 0.015,
+    "openings.closing": 0.003,
+}
 
 
 @pytest.fixture(scope="module")
