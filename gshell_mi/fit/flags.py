@@ -6,93 +6,48 @@ from collections.abc import Iterable
 
 from ..errors import UserError
 
+
+def _without(prefix: str, names: str) -> dict[str, str]:
+    """Old name, prefixed, and new name of each word."""
+    return {prefix + name: name for name in names.split()}
+
+
+_EXTRA_LOSSES = (
+    "hole-opening hole-closing visible-outside visible-inside sdf-sign eikonal "
+    "template-smoothness albedo-chroma light-smoothness"
+).split()
+
 #: What became of the flags, by the new group: old name, new name.
 _MOVED = {
     "": {"preview": "effort preview"},
-    "lattice": {name: name for name in ("start-resolution", "band-resolution")},
-    "topology": {"ghost-min-area": "min-area"}
-    | {name: name for name in ("min-area", "unseen-area", "sheet-thickness")},
-    "hull": {"hull-daylight-votes": "daylight-votes"},
-    "radiance": {
-        "ghost-batch": "batch",
-        "ghost-sheets": "layers",
-        "ghost-lr": "lr",
-        "ghost-smoothing": "smoothing",
-    },
-    "openings": {
-        f"ghost-{name}": name
-        for name in ("iterations", "mask", "daylight", "binary", "closing", "chroma", "rounds")
-    },
-    "cavities": {f"carving-{name}": name for name in ("iterations", "batch", "lr", "radiance-lr")},
-    "refinement": {
-        f"refinement-{name}": name
-        for name in ("iterations", "lr", "smoothing", "detail", "radiance-lr", "outline")
-    },
-    "folds": {f"folds-{name}": name for name in ("iterations", "lr", "detail", "descent")},
-    "volume": {
-        f"volume-{name}": name
-        for name in (
-            "iterations",
-            "side",
-            "resolution",
-            "batch",
-            "density-lr",
-            "radiance-lr",
-            "direction-lr",
-            "mask",
-            "distortion",
-        )
-    },
-    "render": {"step-views": "views"}
-    | {name: name for name in ("spp", "primal-spp", "max-depth", "gradient-depth", "reparam-depth")},
-    "model": {name: name for name in ("field", "light-height")}
-    | {"flexicubes-weights": "field flexicubes", "no-even-start": "no-even-start"},
-    "losses": {"image-loss": "image", "joint-mask": "mask", "joint-depth": "depth"}
-    | {name: name for name in ("material-smoothness", "light-grey", "flexicubes-deviation")}
-    | {
-        name: f"extra {name.replace('-', '_')}"
-        for name in (
-            "hole-opening",
-            "hole-closing",
-            "visible-outside",
-            "visible-inside",
-            "sdf-sign",
-            "eikonal",
-            "template-smoothness",
-            "albedo-chroma",
-            "light-smoothness",
-        )
-    },
+    "lattice": _without("", "start-resolution band-resolution"),
+    "topology": _without("ghost-", "min-area") | _without("", "min-area unseen-area sheet-thickness"),
+    "hull": _without("hull-", "daylight-votes"),
+    "radiance": _without("ghost-", "batch lr smoothing") | {"ghost-sheets": "layers"},
+    "openings": _without("ghost-", "iterations mask daylight binary closing chroma rounds"),
+    "cavities": _without("carving-", "iterations batch lr radiance-lr"),
+    "refinement": _without("refinement-", "iterations lr smoothing detail radiance-lr outline"),
+    "folds": _without("folds-", "iterations lr detail descent"),
+    "volume": _without(
+        "volume-", "iterations side resolution batch density-lr radiance-lr direction-lr mask distortion"
+    ),
+    "render": {"step-views": "views"} | _without("", "spp primal-spp max-depth gradient-depth reparam-depth"),
+    "model": _without("", "field light-height no-even-start") | {"flexicubes-weights": "field flexicubes"},
+    "losses": {"image-loss": "image"}
+    | _without("joint-", "mask depth")
+    | _without("", "material-smoothness light-grey flexicubes-deviation")
+    | {name: f"extra {name.replace('-', '_')}" for name in _EXTRA_LOSSES},
     "joint": {"material-gradient-smoothing": "material-smoothing"}
-    | {
-        name: name
-        for name in (
-            "warmup",
-            "geometry-lr",
-            "msdf-lr",
-            "deform-lr",
-            "geometry-smoothing",
-            "geometry-detail",
-            "material-lr",
-            "color-hold",
-            "light-lr",
-        )
-    },
-    "detail": {"detail-iterations": "iterations"},
+    | _without("", "warmup geometry-lr msdf-lr deform-lr geometry-smoothing geometry-detail")
+    | _without("", "material-lr color-hold light-lr"),
+    "detail": _without("detail-", "iterations"),
 }
 
 #: Flags that nothing has taken the place of.
 GONE = (
-    "color-voxels",
-    "ghost-gain",
-    "vessel-gain",
-    "refinement-gain",
-    "folds-gain",
-    "second-look",
-    "second-look-gain",
-    "joint.revision",
-    "joint.revision-gain",
-)
+    "color-voxels ghost-gain vessel-gain refinement-gain folds-gain second-look second-look-gain "
+    "joint.revision joint.revision-gain"
+).split()
 
 #: The new flag of each old one, without dashes.
 RENAMED = {
