@@ -87,7 +87,8 @@ so a later row starts from what an earlier one has left.
 All openings that the first half of a fit finds are proposed again, and as many round holes where the truth is
 closed: with other random rays, with noise of {noise} on every pixel (white is 1), with each camera turned by
 {pixels:g} pixel in a random direction, and with a random texture on the object that changes its colour by up
-to half, its finest waves as long as a cell. *z* is the gain over its standard error; 2 is needed, and more where many are asked for.
+to half, its finest waves as long as a cell. *z* is the gain over its standard error; 2 is
+needed, and more where many are asked for.
 
 Noise hides what is dark behind an opening. Judged by pixels alone, 2 of the T-shirt's 4 were missed in it;
 the means of blocks tell of them.

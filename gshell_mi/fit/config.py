@@ -89,7 +89,7 @@ class FitConfig:
     """Every so many-th view, from the first one on, is held out: no stage sees it, and it is scored at the
     end; 0 fits to all views. 8 is usual."""
     checkpoint_seconds: float = 10.0
-    """Seconds between checkpoints: what a kill loses at most."""
+    """Seconds between checkpoints while steps are done."""
 
     lattice: LatticeConfig = field(default_factory=LatticeConfig)
     """How fine lattices are, and how their fields are stored."""
@@ -100,7 +100,7 @@ class FitConfig:
     hull: HullConfig = field(default_factory=HullConfig)
     """The visual hull."""
     radiance: RadianceConfig = field(default_factory=RadianceConfig)
-    """The radiance on a mesh, by which the stages up to the refinement judge."""
+    """The radiance on a mesh, by which openings are sought and vertices moved."""
     openings: OpeningsConfig = field(default_factory=OpeningsConfig)
     """Where the hull is open."""
     gains: GainsConfig = field(default_factory=GainsConfig)
@@ -130,7 +130,7 @@ class FitConfig:
 
     @classmethod
     def for_effort(cls, effort: Effort, **changes: Any) -> FitConfig:
-        """The settings of an effort; ``changes`` (``joint__lr`` for ``joint.lr``) replace some of them.
+        """The settings of an effort; ``changes`` replace some (``joint__light_lr`` for ``joint.light_lr``).
 
         >>> FitConfig.for_effort("preview", iterations=3).iterations
         3

@@ -98,11 +98,8 @@ class Runner:
         """Counts what is done inside as time of a stage."""
         begin = time.monotonic()
         yield
-        self.spent(stage, time.monotonic() - begin)
-
-    def spent(self, stage: str, seconds: float) -> None:
-        """Adds to the time of a stage."""
-        self.checkpoint.seconds[stage] = round(self.checkpoint.seconds.get(stage, 0.0) + seconds, 3)
+        spent = self.checkpoint.seconds.get(stage, 0.0) + time.monotonic() - begin
+        self.checkpoint.seconds[stage] = round(spent, 3)
 
     def step(self, stage: str, logged: int, count: int, work: Work, iteration: int) -> dict[str, float]:
         """One step, which the log and the observer hear of as the step ``logged`` of ``count``."""
@@ -194,9 +191,8 @@ class Steps:
             for iteration in range(first, count):
                 if stalled(iteration):
                     break
-                begin = time.monotonic()
-                advance(runner.step(stage, iteration, count, work, iteration))
-                runner.spent(stage, time.monotonic() - begin)
+                with runner.timed(stage):
+                    advance(runner.step(stage, iteration, count, work, iteration))
                 if time.monotonic() - saved > pause:
                     begin = time.monotonic()
                     save(iteration + 1)

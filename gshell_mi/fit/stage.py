@@ -32,7 +32,7 @@ class Fit:
     """What all stages may read.
 
     Attributes:
-        scene: with its targets. Only the joint stage changes its shape.
+        scene: with its targets. Path tracing sets the fields of its shape; no other stage reads them.
         config: the settings.
         lattices: that stages work on.
     """

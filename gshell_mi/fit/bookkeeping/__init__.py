@@ -1,1 +1,1 @@
-"""What a fit keeps while it runs: checkpoint, log, progress, and how it is stopped and watched."""
+"""What a fit keeps of itself: checkpoints, fingerprints of its inputs; and what those see who watch it."""

@@ -49,6 +49,9 @@ _SURVEY = 8
 #: A run's random rays of the survey must not be those of its steps.
 _SURVEY_STEP = 1 << 20
 
+#: Random numbers of where rays begin, apart from those of the lookups.
+_JITTER = 1 << 30
+
 
 class RadianceVolume:
     """Density and radiance at lattice vertices, trained on random pixels.
@@ -65,7 +68,7 @@ class RadianceVolume:
         pixels: the targets' pixels.
         config: how it is trained.
         first: the step to begin with; that of a resumed run.
-        seed: of the random pixels.
+        seed: of all random numbers.
     """
 
     def __init__(
@@ -205,19 +208,23 @@ class RadianceVolume:
         length = dr.norm(direction)
         direction = mi.Vector3f(direction / length)
         cell = dr.opaque(mi.Float, 2 / self.resolution)
-        jitter = mi.PCG32(size=dr.width(t), initstate=dr.opaque(mi.UInt64, step)).next_float32()
+        jitter = self._random(dr.width(t), step + _JITTER).next_float32()
         first = dr.maximum(t * length + (jitter * _STEP - 0.5) * cell, 0)
         far = dr.maximum((-1 - origin) / direction, (1 - origin) / direction)
         rays = origin, direction, first, dr.min(far)
         dr.eval(rays, target, alpha)
         return rays, target, alpha
 
-    def _march(self, rays: tuple, seed: int, *, adjoint: tuple | None = None, survey: tuple | None = None):
+    def _random(self, count: int, step: int) -> mi.PCG32:
+        """Random numbers of one step, as many at a time."""
+        return mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, (self.seed << 32) + step))
+
+    def _march(self, rays: tuple, step: int, *, adjoint: tuple | None = None, survey: tuple | None = None):
         """Composites the volume along rays.
 
         Args:
             rays: from ``_rays``.
-            seed: of the stochastic filtering.
+            step: whose random numbers filter.
             adjoint: the radiance and transmittance that the same call without it gave, and the loss's
                 derivatives by both; the call then replays the rays (Vicini et al., SIGGRAPH 2021).
             survey: sums, by vertex, of the rays that reach it bright and of all.
@@ -235,7 +242,7 @@ class RadianceVolume:
         gradient = dr.zeros(mi.Float, dr.width(values)) if adjoint else None
         dr.eval(values)
         cells, side = dr.opaque(mi.Float, n), dr.opaque(mi.UInt32, n + 1)
-        step = dr.opaque(mi.Float, _STEP * 2 / n)
+        length = dr.opaque(mi.Float, _STEP * 2 / n)
 
         def body(t, transmittance, total, active, random):
             index = _nearby_vertex((origin + t * direction + 1) * (0.5 * cells), cells, side, random)
@@ -261,7 +268,7 @@ class RadianceVolume:
                     active,
                 )
             transmittance = dr.select(active, remaining, transmittance)
-            t = t + step
+            t = t + length
             return t, transmittance, total, active & (t < last) & (transmittance > _DARK), random
 
         count = dr.width(first)
@@ -270,7 +277,7 @@ class RadianceVolume:
             dr.full(mi.Float, 1, count),
             dr.zeros(mi.Color3f, count),
             first < last,
-            mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed)),
+            self._random(count, step),
         )
         _, transmittance, total, _, _ = dr.while_loop(state, lambda t, tr, c, active, r: active, body)
         return gradient if adjoint else (total, transmittance)

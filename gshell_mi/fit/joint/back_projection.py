@@ -107,7 +107,8 @@ class BackProjection:
         self._mesh, self._sensors, self._views, self._lights, self._seed = mesh, sensors, views, lights, seed
         self._targets = targets
         self._faces = mi.UInt32(np.ascontiguousarray(mesh.faces, np.uint32).ravel())
-        self._scene = mi.load_dict({"type": "scene", "subject": mesh.shape(), **objects})
+        self._shape = mesh.shape()
+        self._scene = mi.load_dict({"type": "scene", "subject": self._shape, **objects})
         self._parameters = mi.traverse(self._scene)
         self._color = next(name for name in self._parameters.keys() if name.endswith("subject.vertex_color"))
         self._integrator = mi.load_dict({"type": "path", "max_depth": _DEPTH, "hide_emitters": True})
@@ -162,7 +163,7 @@ class BackProjection:
         rendered, target = (mi.Color3f(rgba.x, rgba.y, rgba.z) for rgba in (rendered, target))
         ray = self._views.pixel_rays(view)
         found = self._scene.ray_intersect_preliminary(ray, coherent=True)
-        covered &= found.is_valid()
+        covered &= found.is_valid() & (found.shape == mi.ShapePtr(self._shape))
         normal = found.compute_surface_interaction(ray, mi.RayFlags.Minimal, covered).n
         # Highlights have less to say. The noise is in the render alone, so sums over the image have no bias.
         dark = dr.opaque(mi.Float, self._dark)

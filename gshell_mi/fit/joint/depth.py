@@ -46,7 +46,8 @@ def depth_error(fit: FitScene, views: PinholeViews, scene: mi.Scene) -> float | 
         if target.depth is None:
             continue
         hit = scene.ray_intersect_preliminary(views.pixel_rays(index))
-        distance = np.where(hit.is_valid().numpy(), hit.t.numpy(), 0)
+        found = hit.is_valid() & (hit.shape == mi.ShapePtr(fit.subject))
+        distance = np.where(found.numpy(), hit.t.numpy(), 0)
         known = target.depth.ravel()
         both = (known > 0) & (distance > 0)
         errors.append(np.abs(distance - known)[both])

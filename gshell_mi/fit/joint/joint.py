@@ -124,7 +124,7 @@ class JointStage:
         return self.geometry.optimizers | others
 
     def step(self, iteration: int) -> dict[str, float]:
-        """One step on ``step_views`` views; returns the losses.
+        """One step on ``render.views`` views; returns the losses.
 
         Raises:
             UserError: the steps before have left no surface.

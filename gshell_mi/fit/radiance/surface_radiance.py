@@ -56,7 +56,7 @@ _EXTRA_STEP = 1 << 20
 
 @dataclass(frozen=True)
 class RadianceConfig:
-    """Radiance and opacity of a template, by which the stages up to the refinement judge."""
+    """Radiance and opacity of a template, by which openings are sought and vertices moved."""
 
     batch: Annotated[int, Between(1)] = 65536
     """Pixels per step over all views, of which those far from the masks are left out."""
@@ -69,7 +69,7 @@ class RadianceConfig:
 
 
 class SurfaceRadiance:
-    """Opacity and two-sided radiance on a fixed mesh, trained on random pixels of all views.
+    """Opacity and two-sided radiance on a mesh, trained on random pixels of all views.
 
     Args:
         vertices: (V, 3) positions, world units.

@@ -70,7 +70,7 @@ class RadianceVolume:
         config: how it is trained.
         surface: vertices (V, 3) and faces (F, 3) to show meanwhile, world units.
         stored: what ``arrays`` gave, of a run to go on with.
-        seed: of the random pixels.
+        seed: of all random numbers.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class RadianceVolume:
             self._refine()
         rays, target, alpha = self._rays(iteration)
         packets = self._packets()
-        seen = composite(self.bricks, packets, rays, iteration)
+        seen = composite(self.bricks, packets, rays, self._seed_of(iteration))
         dr.eval(seen.radiance, seen.transmittance, seen.spread)
         dr.enable_grad(seen.radiance, seen.transmittance)
         other = dr.arange(mi.UInt32, dr.width(alpha)) ^ 1
@@ -143,7 +143,8 @@ class RadianceVolume:
             dr.grad(seen.transmittance),
             dr.opaque(mi.Float, config.distortion),
         )
-        self._descend(composite(self.bricks, packets, rays, iteration, adjoint=adjoint), iteration)
+        gradient = composite(self.bricks, packets, rays, self._seed_of(iteration), adjoint=adjoint)
+        self._descend(gradient, iteration)
         count = max(dr.width(alpha), 1)
         image, mask = image[0] / count, mask[0] / count
         return {
@@ -235,13 +236,17 @@ class RadianceVolume:
 
     # --- steps
 
+    def _seed_of(self, step: int) -> int:
+        """Of the random numbers of a step."""
+        return (self.seed << 32) + step
+
     def _rays(self, step: int) -> tuple[Rays, mi.Color3f, mi.Float]:
         """Random pixels' rays, and the targets' radiance and coverage."""
         sample = self.pixels.sample(
             self.config.batch // _RAYS, seed=self.seed, step=step, rays=_RAYS, together=_TOGETHER
         )
         ray = self.to_lattice @ self.views.rays(sample.view, sample.film)
-        return Rays.through(self.bricks, ray, jitter=step), sample.radiance, sample.alpha
+        return Rays.through(self.bricks, ray, jitter=self._seed_of(step)), sample.radiance, sample.alpha
 
     def _packets(self) -> mi.Float:
         """What rays read: per voxel four numbers, radiance and optical depth, or 16 with the slopes of the

@@ -52,7 +52,7 @@ def volume_surface(
 
     Args:
         volume: trained.
-        scene: its subject is left with other fields.
+        scene: whose subject says where the lattice is.
         lattice: whose vertices make a cube.
         light: of what was seen.
         progress: called without arguments after each view.

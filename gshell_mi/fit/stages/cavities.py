@@ -25,7 +25,7 @@ class CavitiesConfig:
     """Folds and hollows that the hull bridges."""
 
     iterations: int = 1000
-    """Steps of the fog; 0 leaves the hull as it is."""
+    """Steps of the fog; 0 carves nothing. Walls behind openings are tried all the same."""
     batch: Annotated[int, Between(1)] = 65536
     """Pixels per step over all views, of which those far from the masks are left out."""
     lr: float = 0.6

@@ -1,8 +1,8 @@
 """Joint and detail stage: geometry, material and light by differentiable path tracing.
 
 The joint stage works on a lattice of few cells, as a step moves a surface by a fraction of a cell; the detail
-stage goes on from there on the lattice that the fit ends on. Both let openings be revised on the way, as a
-path tracer knows how dark it is behind them.
+stage goes on from there on the lattice that the fit ends on. Both move the rims of openings;
+which openings there are is asked again between them (``revision``).
 """
 
 from __future__ import annotations

@@ -64,9 +64,9 @@ def capture():
     return sensors, PinholeViews.from_sensors(sensors), targets
 
 
-def _work(capture, mesh, kept) -> BackProjection:
+def _work(capture, mesh, kept, objects=LIGHT) -> BackProjection:
     sensors, views, targets = capture
-    return BackProjection(mesh, LIGHT, sensors, views, targets, [], kept)
+    return BackProjection(mesh, objects, sensors, views, targets, [], kept)
 
 
 def test_checks_are_found(capture):
@@ -99,3 +99,20 @@ def test_it_goes_on_where_it_was(capture):
         begun.step(step)
     for name, values in whole.state().items():
         np.testing.assert_allclose(begun.state()[name], values, rtol=1e-4, atol=1e-4)
+
+
+def test_what_stands_before_the_object_tells_nothing_of_it(capture):
+    """A card before the camera in the middle: its triangles are not the object's first ones."""
+    transform = mi.ScalarTransform4f().translate([0, 0, 2.5]).scale(0.05)
+    card = {"card": {"type": "rectangle", "to_world": transform}}
+
+    def told(objects: dict) -> np.ndarray:
+        """Of each vertex, how much images of a part of a round say of it."""
+        work = _work(capture, _plate(_grey), {}, objects)
+        for step in range(len(capture[0]) - 1):
+            work.step(step)
+        return work.state()["images"].reshape(-1, 3)[:, 0]
+
+    hidden, seen = told(LIGHT | card), told(LIGHT)
+    assert (hidden <= seen + 1e-3).all(), "no vertex hears of more pixels"
+    assert hidden.sum() < 0.99 * seen.sum()
