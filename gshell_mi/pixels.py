@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from .targets import Target
+from .targets import Target, mean_radiance
 from .views import PinholeViews
 
 #: Coverage of a pixel from which on nothing of the background is in it.
@@ -17,6 +17,9 @@ COVERED = 0.99
 
 #: Coverage of a pixel below which it shows the background: the rest is noise.
 FAINT = 0.01
+
+#: Radiance, over the mean of what is covered, below which noise and haze have their say.
+DARK = 0.1
 
 #: Pixels this near to a mask are drawn, too: a template that is still to move may reach beyond it.
 _MARGIN = 3
@@ -86,9 +89,7 @@ class PixelPool:
         self._count = len(row)
         self._share = self._count / int(views.sizes[chosen].prod(axis=1).sum())
         self.has_alpha = all(target.has_alpha for target in targets)
-        color = sum(float(target.rgba[..., :3].sum(dtype=np.float64)) for target in targets)
-        coverage = sum(float(target.rgba[..., 3].sum(dtype=np.float64)) for target in targets)
-        self._mean_radiance = color / max(3 * coverage, 1e-6)
+        self._mean_radiance = mean_radiance(targets)
 
     @property
     def share(self) -> mi.Float:

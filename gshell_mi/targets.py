@@ -110,6 +110,13 @@ def load_target(path: Path, width: int, height: int) -> Target:
     )
 
 
+def mean_radiance(targets: list[Target]) -> float:
+    """Of what targets cover, over their pixels and channels."""
+    color = sum(float(target.rgba[..., :3].sum(dtype=np.float64)) for target in targets)
+    coverage = sum(float(target.rgba[..., 3].sum(dtype=np.float64)) for target in targets)
+    return color / max(3 * coverage, 1e-6)
+
+
 def depth_file(path: Path) -> Path | None:
     """The depth map beside a target, if there is one."""
     depth = path.with_suffix(".depth.exr")

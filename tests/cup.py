@@ -100,7 +100,7 @@ def fit_of(subject: mi.Shape, shape: trimesh.Trimesh, config: FitConfig = CONFIG
         config=config,
         training=training,
         judge=judges[0],
-        held_out_judge=judges[1],
+        validation_judge=judges[1],
         cell=lambda surface: surface.lattice.spacing * subject.length_scale,
     )
 

@@ -78,7 +78,7 @@ def test_fit_example(bowl_scene, tmp_path, variant):
     code = example(5, variant)
     for said, here in {
         '"scenes/tshirt.xml"': repr(str(bowl_scene)),
-        '"out/tshirt"': repr(str(tmp_path / "out")),
+        '"out/first"': repr(str(tmp_path / "out")),
         "config=FitConfig()": "config=config, report=False",
     }.items():
         assert said in code

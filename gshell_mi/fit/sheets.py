@@ -11,7 +11,7 @@ from .stage import Fit
 from .surface import Surface
 
 #: Size of the new mSDF, in cells.
-_SURE = 0.5
+SURE = 0.5
 
 
 def with_open_sheets(fit: Fit, surface: Surface) -> Surface:
@@ -27,5 +27,5 @@ def with_open_sheets(fit: Fit, surface: Surface) -> Surface:
     if not side.any():
         return surface
     # Both sides hang on the same vertices of the lattice: without the other, it would open, too.
-    values = np.where(side, -_SURE, _SURE) * lattice.spacing
+    values = np.where(side, -SURE, SURE) * lattice.spacing
     return surface.with_fields(msdf=rewritten(msdf, values, sheets, template, lattice).numpy())

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from .config import FitConfig
     from .runner import Steps
 
-#: Every eighth view is held out: it judges what the others are fitted to.
-_HOLD_OUT = 8
+#: Every eighth view validates what the others are fitted to; what ``--hold-out`` keeps no stage sees at all.
+_VALIDATION = 8
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class Fit:
 
     @cached_property
     def training(self) -> PixelPool:
-        """The pixels of the views that are not held out."""
-        return PixelPool(self.views, self.scene.targets, self._held_out[0])
+        """The pixels of the views that shapes are fitted to; the others validate them."""
+        return PixelPool(self.views, self.scene.targets, self._validation[0])
 
     @cached_property
     def judge(self) -> Judge:
@@ -67,20 +67,20 @@ class Fit:
         return self._judge(Judge.halves(len(self.views)))
 
     @cached_property
-    def held_out_judge(self) -> Judge:
-        """Tells what the views say that the ``training`` pixels are not of."""
-        return self._judge([self._held_out])
+    def validation_judge(self) -> Judge:
+        """Tells what the other views say of what was fitted to ``training``."""
+        return self._judge([self._validation])
 
     def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]]) -> Judge:
         config = self.config
         return Judge(self.views, self.scene.targets, splits, batch=config.radiance.batch, seed=config.seed)
 
     @property
-    def _held_out(self) -> tuple[np.ndarray, np.ndarray]:
+    def _validation(self) -> tuple[np.ndarray, np.ndarray]:
         """Indices of the views that shapes are fitted to, and of the others."""
         every = np.arange(len(self.views))
-        held_out = every[::_HOLD_OUT]
-        return np.setdiff1d(every, held_out) if len(every) > 1 else every, held_out
+        validation = every[::_VALIDATION]
+        return np.setdiff1d(every, validation) if len(every) > 1 else every, validation
 
     def corrected(self, surface: Surface) -> Fit:
         """The same with what was found of the views: targets as if all were exposed alike, without what is
@@ -92,7 +92,7 @@ class Fit:
         Args:
             surface: that tells; of a fit as it was given.
         """
-        for pool in ("pixels", "training", "judge", "held_out_judge"):
+        for pool in ("pixels", "training", "judge", "validation_judge"):
             self.__dict__.pop(pool, None)
         targets, sensors = self.scene.targets, self.scene.sensors
         if surface.gains is not None:

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+import mitsuba as mi
 import numpy as np
 
+from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..lattice import GRIDS, BlockLattice, Lattice
+from ..template.msdf import splat_to_lattice
 
 #: Median reflectance that the first split of radiance into material and light assumes.
 TYPICAL_REFLECTANCE = 0.5
@@ -40,6 +43,15 @@ class Seen:
     radiance: np.ndarray
     known: np.ndarray
     light: np.float32
+
+    @classmethod
+    def on(
+        cls, lattice: Lattice, template: SurfaceMesh, radiance: np.ndarray, light: np.float32 | None = None
+    ) -> Seen:
+        """From (V, 3) radiance of a template's vertices; by default under the light that explains it."""
+        spread, known = splat_to_lattice(mi.Float(radiance.ravel()), template, lattice)
+        light = cls.even_light(radiance) if light is None else light
+        return cls(spread.numpy().reshape(-1, 3), known.numpy(), light)
 
     @staticmethod
     def even_light(radiance: np.ndarray) -> np.float32:
@@ -157,22 +169,22 @@ class Surface:
         if "radiance" in arrays:
             seen = Seen(arrays["radiance"], arrays["known"], np.float32(arrays["light"]))
         stages = sorted({tuple(name.split(" ")[1:3]) for name in arrays if name.startswith("moved ")})
-        moved = [_moved(stage, _under(arrays, f"moved {index} {stage} ")) for index, stage in stages]
+        moved = [_moved(stage, under(arrays, f"moved {index} {stage} ")) for index, stage in stages]
         return cls(
             fields,
             arrays.get("hull"),
             seen,
             tuple(moved),
-            _under(arrays, "model "),
+            under(arrays, "model "),
             bool(arrays["settled"]),
             **{name: arrays.get(name) for name in _OF_VIEWS},
         )
 
 
 def _moved(stage: str, arrays: Mapping[str, np.ndarray]) -> Moved:
-    return Moved(stage, arrays["positions"], arrays["radiance"], _under(arrays, "fitted "))
+    return Moved(stage, arrays["positions"], arrays["radiance"], under(arrays, "fitted "))
 
 
-def _under(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+def under(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """The arrays whose names have a prefix, without it."""
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

@@ -12,14 +12,12 @@ from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..fields.thin_parts import back_on_solid
 from ..lattice import BlockLattice, Lattice
+from ..template.msdf import CERTAIN
 from ..triangles import positive_part
 from .surface import Surface
 
 #: A template takes its opacity from another one that is at most this many cells away ...
 _REACH = 1.5
-
-#: ... and has this logit elsewhere.
-_CERTAIN = 3.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +84,6 @@ def template_of(subject: mi.Shape, surface: Surface, *, like: Template | None = 
     if like is not None:
         distance, nearest = cKDTree(like.vertices).query(vertices)
         near = distance < _REACH * lattice.spacing * subject.length_scale
-        logits = np.where(near, like.logits[nearest], _CERTAIN)
+        logits = np.where(near, like.logits[nearest], CERTAIN)
     start = back_on_solid(vertices, faces, np.where(logits > 0, subject.length_scale * excess, 0))
     return Template(mesh, vertices, faces, logits, start)

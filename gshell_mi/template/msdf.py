@@ -13,7 +13,7 @@ from ..topology import equal_patches, mesh_components
 from ..triangles import vertex_areas
 
 #: Logits beyond this say no more than "certain"; ν stays near the scale of a distance in cells.
-_CERTAIN = 3.0
+CERTAIN = 3.0
 
 #: What a speck leaves at its neighbours when it goes may be the next one.
 _CLEANINGS = 4
@@ -79,7 +79,7 @@ def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: Latti
 
     The scale is about that of a distance: one cell per logit; where the template is far away, 1 cell.
     """
-    values = mi.Float(np.clip(logits, -_CERTAIN, _CERTAIN).astype(np.float32))
+    values = mi.Float(np.clip(logits, -CERTAIN, CERTAIN).astype(np.float32))
     msdf, known = splat_to_lattice(values, template, lattice)
     return dr.select(known, msdf, 1) * lattice.spacing
 

@@ -9,25 +9,22 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ...template.msdf import clean_opacity, msdf_from_template, splat_to_lattice, without_specks
+from ...template.msdf import CERTAIN, clean_opacity, msdf_from_template, without_specks
 from ...topology import topology
 from ...triangles import positive_part
 from ..radiance.acceptance import close_rejected
+from ..radiance.on_template import fitted_radiance
 from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import Template, template_of
-from .fitted_radiance import fitted_radiance
+from .density_grid import DensityGrid
 from .hollows import SEEN, hollowed, hollows
-from .radiance_volume import RadianceVolume
 
 #: Space is empty below this opacity of a cell.
 _EMPTY = 0.3
 
-#: Logit of a vertex that is taken to be open (its negative).
-_CERTAIN = 3.0
 
-
-def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
+def carve(fit: Fit, surface: Surface, volume: DensityGrid) -> Surface | None:
     """Hollows out a template as far as held-out views are explained better.
 
     Args:
@@ -72,20 +69,19 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
         return None
     if not fit.config.watertight:
         # Now that what lies behind is in its place, the images may justify more openings.
-        proposed = clean(np.where(_in_empty_space(after, volume, opacity, seen), -_CERTAIN, cleaned))
+        proposed = clean(np.where(_in_empty_space(after, volume, opacity, seen), -CERTAIN, cleaned))
         closed = fit.judge.shown(after.closed)
         justified = close_rejected(proposed, closed, fit.judge, closed.whole)
         # Those that there were have been judged, and a close call may come out otherwise now.
         cleaned = clean(np.where(cleaned > 0, justified, proposed))
     radiance = fitted_radiance(after, fit).radiance()[0]
-    radiance, found = splat_to_lattice(mi.Float(radiance.ravel()), after.mesh, lattice)
     msdf = without_specks(msdf_from_template(cleaned, after.mesh, lattice), after.mesh, lattice, min_area)
-    seen = Seen(radiance.numpy().reshape(-1, 3), found.numpy(), surface.seen.light)
+    seen = Seen.on(lattice, after.mesh, radiance, surface.seen.light)
     return replace(carved.with_fields(msdf=msdf.numpy()), seen=seen)
 
 
 def _in_empty_space(
-    template: Template, volume: RadianceVolume, opacity: np.ndarray, seen: np.ndarray
+    template: Template, volume: DensityGrid, opacity: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
     """(V,) whether there is nothing within a cell of a vertex, and it is seen."""
     local = volume.to_lattice @ mi.Point3f(np.ascontiguousarray(template.vertices.T, np.float32))
@@ -96,9 +92,7 @@ def _in_empty_space(
     )
 
 
-def _kept(
-    fit: Fit, before: Template, after: Template, label: np.ndarray, volume: RadianceVolume
-) -> np.ndarray:
+def _kept(fit: Fit, before: Template, after: Template, label: np.ndarray, volume: DensityGrid) -> np.ndarray:
     """(count,) which hollows explain unseen views better, by the rays that enter them."""
     local = volume.to_lattice @ mi.Point3f(np.ascontiguousarray(before.vertices.T, np.float32))
     index = np.rint(((local + 1) * (0.5 * volume.resolution)).numpy()[::-1]).astype(int)

@@ -19,13 +19,13 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from ...template.msdf import msdf_from_template, splat_to_lattice
+from ...template.msdf import CERTAIN, msdf_from_template
 from ...topology import equal_patches
+from ..radiance.on_template import fitted_radiance
 from ..radiance.shown import Shown
 from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import Template, template_of
-from .fitted_radiance import fitted_radiance
 from .hollows import hollowed
 
 #: Thickness of a wall, in cells, that tells vessels; those that are tried for them then.
@@ -36,9 +36,6 @@ _DEPTHS = 0.75, 0.5, 0.25
 
 #: Vertices up to this many cells from an opening lie right behind it, and hollows are deeper than this.
 _BEHIND, _SHALLOW = 1.5, 4.0
-
-#: Logit of a vertex that is taken to be surface.
-_CERTAIN = 3.0
 
 
 def hollowed_vessels(fit: Fit, surface: Surface) -> Surface | None:
@@ -59,9 +56,8 @@ def hollowed_vessels(fit: Fit, surface: Surface) -> Surface | None:
         return None
     carved, lattice = vessel.template, surface.lattice
     front, _ = fitted_radiance(carved, fit).radiance()
-    radiance, found = splat_to_lattice(mi.Float(front.ravel()), carved.mesh, lattice)
     msdf = msdf_from_template(carved.logits, carved.mesh, lattice)
-    seen = Seen(radiance.numpy().reshape(-1, 3), found.numpy(), surface.seen.light)
+    seen = Seen.on(lattice, carved.mesh, front, surface.seen.light)
     return replace(vessel.surface.with_fields(msdf=msdf.numpy()), seen=seen)
 
 
@@ -155,7 +151,7 @@ class _Trials:
         if hollow is None:
             return None
         surface = hollowed(self.surface, hollow.distance)
-        closed = replace(self.template, logits=np.where(mouth, _CERTAIN, self.template.logits))
+        closed = replace(self.template, logits=np.where(mouth, CERTAIN, self.template.logits))
         carved = template_of(self.fit.scene.subject, surface, like=closed)
         return _Vessel(hollow, surface, carved, self.fit.judge.shown(carved.surface))
 

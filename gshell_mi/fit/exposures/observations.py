@@ -12,22 +12,18 @@ from scipy.cluster.vq import kmeans2
 
 from ...compat import mesh_scene
 from ...fields.smoothing import MeshDiffusion
-from ...pixels import COVERED
-from ...targets import Target
+from ...pixels import COVERED, DARK
+from ...targets import Target, mean_radiance
 from ...template.normals import vertex_normals
+from ...triangles import unit
 from ...views import PinholeViews
+from ...visibility import GRAZING, hidden
 
 #: Lambda that smooths normals along the mesh: those of a lattice's mesh have its steps in them.
 _SMOOTHING = 8.0
 
-#: Least cosine between the normal of a place and the direction to a camera that sees it.
-_GRAZING = 0.3
-
 #: An 8-bit photograph ends at 1. What is nearly as bright may have been brighter.
 _CLIPPED = 0.97
-
-#: Radiance, as a fraction of the mean of what is covered, below which noise and haze have their say.
-_DARK = 0.1
 
 #: Parts of the surface, of which the others foretell what is seen of one.
 REGIONS = 8
@@ -103,23 +99,22 @@ def observe(
     region = _regions(points, rng)
     device_points = mi.Point3f(np.ascontiguousarray(points.T, np.float32))
     found: list[tuple[np.ndarray, ...]] = []
-    floor = _DARK * _mean_radiance(targets)
+    floor = DARK * mean_radiance(targets)
     for view, target in enumerate(targets):
         film, depth = (np.array(value) for value in views.project(view, device_points))
-        outwards = views.origins[view] - points
-        outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-12)
+        outwards = unit(views.origins[view] - points)
         cosine = (normals * outwards).sum(axis=1)
         size = views.sizes[view]
         column, row = np.floor(film * size[:, None]).astype(int)
         seen = (
-            (np.abs(cosine) > _GRAZING)
+            (np.abs(cosine) > GRAZING)
             & (depth > 0)
             & (column >= 0)
             & (column < size[0])
             & (row >= 0)
             & (row < size[1])
         )
-        seen &= ~_hidden(scene, points + cell * outwards, outwards)
+        seen &= ~hidden(scene, points + cell * outwards, outwards)
         index = np.flatnonzero(seen)
         if not len(index):
             continue
@@ -155,7 +150,7 @@ def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     positions, corners = mi.Float(vertices.ravel().astype(np.float32)), mi.Vector3u(faces.T.astype(np.uint32))
     smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
     normals = smooth(vertex_normals(positions, corners)).numpy().reshape(-1, 3).astype(np.float64)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return unit(normals)
 
 
 def _regions(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -163,12 +158,6 @@ def _regions(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     if len(points) < REGIONS:
         return np.arange(len(points))
     return kmeans2(points, REGIONS, minit="++", rng=rng)[1]
-
-
-def _hidden(scene: mi.Scene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """(P,) whether there is something in the way."""
-    origin, direction = (np.ascontiguousarray(array.T, np.float32) for array in (origins, directions))
-    return np.array(scene.ray_test(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))))
 
 
 def _averages(target: Target, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -181,11 +170,3 @@ def _averages(target: Target, side: int) -> tuple[np.ndarray, np.ndarray]:
         spoilt |= color.max(axis=-1) > _CLIPPED
     whole = ~ndimage.maximum_filter(spoilt, side, mode="constant", cval=True)
     return ndimage.uniform_filter(color, (side, side, 0)), whole
-
-
-def _mean_radiance(targets: list[Target]) -> float:
-    color, coverage = (
-        sum(float(target.rgba[..., part].sum(dtype=np.float64)) for target in targets)
-        for part in (slice(3), 3)
-    )
-    return color / max(3 * coverage, 1e-6)

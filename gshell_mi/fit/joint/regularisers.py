@@ -19,6 +19,7 @@ from ...material import GivenMaterial, MaterialField
 from ...means import mean
 from ...scene import FitScene
 from ...views import PinholeViews
+from ...visibility import is_visible
 from .config import LossConfig
 
 #: Coverage from which on a pixel shows one surface.
@@ -26,9 +27,6 @@ _WHOLE = 0.99
 
 #: Depths that differ by more cells than this are those of different surfaces.
 _DEPTH_LIMIT = 4.0
-
-#: A boundary vertex is seen if nothing is nearer to the camera than this fraction of its distance.
-_UNTIL = 0.999
 
 
 @dataclass(frozen=True)
@@ -149,12 +147,7 @@ class StepView:
 
     def is_visible(self, points: mi.Point3f) -> mi.Bool:
         """Whether the view frames points and nothing is before them."""
-        view = dr.opaque(mi.UInt32, self.view)
-        film, depth = self.views.project(view, points)
-        origin = self.views.origins_of(view)
-        framed = (depth > 0) & (film.x >= 0) & (film.x <= 1) & (film.y >= 0) & (film.y <= 1)
-        ray = mi.Ray3f(origin, points - origin, _UNTIL, 0.0, mi.Color0f())
-        return framed & ~self.scene.ray_test(ray, framed)
+        return is_visible(self.scene, self.views, dr.opaque(mi.UInt32, self.view), points)
 
 
 class Regularisers:

@@ -69,9 +69,8 @@ class Alignment:
         """Corrected so far."""
         return self.corrections.views(self.given)
 
-    def step(self, kinds: Sequence[Sequence[Evidence]]) -> float:
-        """One step, by one evidence or more of all views; returns its root mean square, in radians and parts
-        of the distance."""
+    def step(self, kinds: Sequence[Sequence[Evidence]]) -> None:
+        """One step, by one evidence or more of all views."""
         views = self.views
         now = self.corrections.to_array() / self._units
         information, pull = np.zeros((len(views), 6, 6)), np.zeros((len(views), 6))
@@ -87,10 +86,7 @@ class Alignment:
             squares = (mean**2).mean(axis=0) + np.einsum("nii->ni", posterior).mean(axis=0)
             # One spread of rotations and one of shifts, whatever the direction.
             self._spread = np.maximum(squares.reshape(2, 3).mean(axis=1).repeat(3), 1e-12)
-        found = Corrections.from_array(mean * self._units).as_given(self.given)
-        moved = found.to_array() / self._units - now
-        self.corrections = found
-        return float(np.sqrt((moved**2).mean()))
+        self.corrections = Corrections.from_array(mean * self._units).as_given(self.given)
 
     def verdict(self, kinds: Sequence[Sequence[Evidence]]) -> Verdict:
         """Whether steps are worth it: what one half of each image asks for has to explain the other half."""

@@ -5,27 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import mitsuba as mi
 import numpy as np
 import trimesh
 from scipy import ndimage
 
 from ...compat import mesh_scene
-from ...pixels import COVERED
+from ...pixels import COVERED, DARK
 from ...targets import Target
 from ...triangles import unit
 from ...views import PinholeViews
+from ...visibility import GRAZING, hidden
 from .corrections import projected
-
-#: Least cosine between a normal and the direction to a camera: beyond, texture is foreshortened to nothing.
-_GRAZING = 0.3
 
 #: Of a blur that texture is left of, and of one, wider by this factor, that is taken away: shading and
 #: exposure differ from view to view, fine texture does not.
 _BAND = 5.0
-
-#: Radiance, over the mean of what is covered, below which noise has its say.
-_DARK = 0.1
 
 #: Views that see a place, at least, for their mean to be a texture.
 _VIEWS = 3
@@ -84,7 +78,7 @@ class Texture:
             for target in targets
             if (target.rgba[..., 3] > COVERED).any()
         ]
-        self._dark = _DARK * float(np.mean(means or [1.0]))
+        self._dark = DARK * float(np.mean(means or [1.0]))
 
     def level(self, blur: float, views: PinholeViews) -> Callable[[PinholeViews], list[Evidence]]:
         """Evidence in images that are blurred by so many pixels; what is hidden is told for given views."""
@@ -109,11 +103,8 @@ class Texture:
         points = self.points
         toward = unit(views.origins[view] - points)
         cosine = (self._normals * toward).sum(axis=1)
-        point, direction = (
-            np.ascontiguousarray(array.T, np.float32) for array in (points + self._cell * toward, toward)
-        )
-        hidden = np.array(self._scene.ray_test(mi.Ray3f(mi.Point3f(point), mi.Vector3f(direction))))
-        index = np.flatnonzero(~hidden & (np.abs(cosine) > _GRAZING))
+        behind = hidden(self._scene, points + self._cell * toward, toward)
+        index = np.flatnonzero(~behind & (np.abs(cosine) > GRAZING))
         return index, 2 * index + (cosine[index] < 0), np.abs(cosine[index])
 
     def _evidence(

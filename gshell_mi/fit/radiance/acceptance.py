@@ -13,7 +13,7 @@ from ..judge import Judge, places_of
 from .shown import Part, Shown
 
 #: Rounds in which openings are closed; in the last one all that are rejected.
-_CLOSINGS = 7
+CLOSINGS = 7
 
 #: Openings that are this near to the worst close together.
 WORST = 0.5
@@ -77,7 +77,7 @@ def close_rejected(
         # Nothing at all explains no image.
         return np.where(given, logits, -logits)
     kept, trimmed, closed = opened, np.zeros_like(opened), 0
-    for closing in reversed(range(_CLOSINGS)):
+    for closing in reversed(range(CLOSINGS)):
         place = places_of(kept, lobes(kept, faces))
         after = template.part(np.where(kept | given, -np.abs(logits), np.abs(logits)))
         verdict = replace(judge.compare(before, after, place), rejected=closed)

@@ -2,13 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
 from .lanes import chosen_lanes
+
+_Value = TypeVar("_Value")
+
+
+def interpolated(
+    kind: type[_Value],
+    values: mi.Float,
+    vertices: Iterable[mi.UInt32],
+    weights: Iterable[mi.Float],
+    active: bool | mi.Bool = True,
+) -> _Value:
+    """Values of a ``kind``, interleaved in ``values``, of three vertices, by barycentric weights."""
+    return sum(
+        (
+            weight * dr.gather(kind, values, vertex, active)
+            for vertex, weight in zip(vertices, weights, strict=True)
+        ),
+        kind(0),
+    )
 
 
 @dataclass
@@ -32,10 +52,7 @@ class Sheet:
 
     def interpolate(self, values: mi.Float) -> mi.Float:
         """One value per vertex at the hits."""
-        return sum(
-            weight * dr.gather(mi.Float, values, corner)
-            for weight, corner in zip(self.weights, self.face, strict=True)
-        )
+        return interpolated(mi.Float, values, self.face, self.weights)
 
     def side(self, corner: mi.UInt32) -> mi.UInt32:
         """Of a corner, the place of the side that is seen among values (V, 2): front, then back."""

@@ -59,7 +59,7 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class Seen:
+class Composited:
     """What rays see: ``radiance``, ``transmittance``, and of the samples' weights the sum, the sum times
     distance, and the distortion (Barron et al., CVPR 2022, eq. 15), as ``spread``."""
 
@@ -89,7 +89,7 @@ def composite(
     *,
     adjoint: Adjoint | None = None,
     greatest: mi.Float | None = None,
-) -> Seen | mi.Float:
+) -> Composited | mi.Float:
     """Composites a volume along rays by stochastic filtering.
 
     Args:
@@ -174,7 +174,7 @@ def composite(
         mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed)),
     )
     _, transmittance, total, spread, *_ = dr.while_loop(state, lambda *values: values[5], body)
-    return Seen(total, transmittance, spread) if gradient is None else gradient
+    return Composited(total, transmittance, spread) if gradient is None else gradient
 
 
 def depth_along(bricks: Bricks, packets: mi.Float, rays: Rays) -> mi.Float:

@@ -14,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...pixels import DARK
+
 #: Degree of the spherical harmonics: about what a lobe of roughness 0.3 leaves of the surroundings.
 _DEGREE = 4
 
@@ -25,9 +27,6 @@ _LEAST = 0.1
 
 #: Relative errors of radiance larger than this are cut off: they are none of gloss.
 _OUTLIER = 2.0
-
-#: Radiance below this fraction of the mean has no relative errors.
-_DARK = 0.1
 
 #: Variance of a coefficient that is expected, over that of the noise of a ray.
 _RIDGE = 1e-3
@@ -75,7 +74,7 @@ class Mirrored:
             for channel, (seen, own, now) in enumerate(
                 zip(radiance.numpy(), color.numpy(), explained, strict=True)
             ):
-                scale = 1 / np.maximum(own, max(_DARK * own.mean(), 1e-9))
+                scale = 1 / np.maximum(own, max(DARK * own.mean(), 1e-9))
                 slope = basis * (own * scale)
                 left[channel] += slope @ slope.T
                 right[channel] += slope @ np.clip((seen - now) * scale, -_OUTLIER, _OUTLIER)

@@ -21,7 +21,7 @@ from ...pixels import COVERED, PixelPool, PixelSample
 from ...template.normals import vertex_normals
 from ...views import PinholeViews
 from .lanes import chosen_lanes, joined_lanes
-from .layers import Sheet, trace_layers
+from .layers import Sheet, interpolated, trace_layers
 from .mirrored import Mirrored, mirrored_direction
 
 #: Batches of rays that tell the colours, and of rays that judge.
@@ -69,23 +69,12 @@ class Met:
 
     def interpolate(self, colors: mi.Float) -> mi.Color3f:
         """Colours of the sides of vertices at the hits."""
-        return sum(
-            (
-                weight * dr.gather(mi.Color3f, colors, vertex, self.hit)
-                for vertex, weight in zip(self.vertices, self.weights, strict=True)
-            ),
-            mi.Color3f(0),
-        )
+        return interpolated(mi.Color3f, colors, self.vertices, self.weights, self.hit)
 
     def values_at(self, values: mi.Float) -> mi.Float:
         """One value per vertex, whichever its side, at the hits."""
-        return sum(
-            (
-                weight * dr.gather(mi.Float, values, vertex >> 1, self.hit)
-                for vertex, weight in zip(self.vertices, self.weights, strict=True)
-            ),
-            mi.Float(0),
-        )
+        vertices = [side >> 1 for side in self.vertices]
+        return interpolated(mi.Float, values, vertices, self.weights, self.hit)
 
     def at(self, lane: mi.UInt32) -> Met:
         """The same on some lanes."""
@@ -311,13 +300,7 @@ class Shown:
         )
 
     def _met(self, sheet: Sheet) -> Met:
-        normal = sum(
-            (
-                weight * dr.gather(mi.Vector3f, self._normals, corner)
-                for weight, corner in zip(sheet.weights, sheet.face, strict=True)
-            ),
-            mi.Vector3f(0),
-        )
+        normal = interpolated(mi.Vector3f, self._normals, sheet.face, sheet.weights)
         return Met(
             [sheet.side(corner) for corner in sheet.face],
             list(sheet.weights),

@@ -28,7 +28,7 @@ from ..bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from .contrast import Contrast
-from .layers import Sheet, trace_layers
+from .layers import Sheet, interpolated, trace_layers
 from .mirrored import Mirrored, mirrored_direction
 
 #: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
@@ -141,16 +141,14 @@ class SurfaceRadiance:
             self._normals = self._smooth_normals()
         move_mesh(self.scene, positions)
 
-    def take_over(self, positions: np.ndarray, fitted: Mapping[str, np.ndarray], opaque: np.ndarray) -> None:
+    def take_over(self, positions: np.ndarray, fitted: Mapping[str, np.ndarray]) -> None:
         """Goes on where another one on the same template was after a ``refit``.
 
         Args:
             positions: (V, 3) of the vertices.
             fitted: what its ``fitted`` gave.
-            opaque: (V,) which vertices are.
         """
         self.move(mi.Float(positions.ravel()))
-        self._set_opacity(np.where(opaque, _CERTAIN_LOGIT, -_CERTAIN_LOGIT))
         self._opacity_rests = True
         restore_optimizer("radiance", self.optimizer, fitted)
 
@@ -263,9 +261,8 @@ class SurfaceRadiance:
         fronts = [count, *(dr.width(sheet.lane) for sheet in sheets)]
         # From the last to the first: each has lanes of its own.
         for sheet, width in reversed(list(zip(sheets, fronts, strict=False))):
-            color = mi.Color3f(0)
-            for weight, corner in zip(sheet.weights, sheet.face, strict=True):
-                color += weight * dr.gather(mi.Color3f, self.optimizer["radiance"], sheet.side(corner))
+            sides = [sheet.side(corner) for corner in sheet.face]
+            color = interpolated(mi.Color3f, self.optimizer["radiance"], sides, sheet.weights)
             color = softplus(color)
             if self._mirrored:
                 mirrored = mirrored_direction(dr.normalize(sheet.direction), self._normal(sheet))
@@ -277,11 +274,8 @@ class SurfaceRadiance:
 
     def _normal(self, sheet: Sheet) -> mi.Vector3f:
         """Smooth normals at hits, of any length."""
-        normal = mi.Vector3f(0)
-        for weight, corner in zip(sheet.weights, sheet.face, strict=True):
-            # What depends on the view is to explain highlights, not to turn the surface.
-            normal += dr.detach(weight) * dr.gather(mi.Vector3f, self._normals, corner)
-        return normal
+        # What depends on the view is to explain highlights, not to turn the surface.
+        return interpolated(mi.Vector3f, self._normals, sheet.face, dr.detach(sheet.weights))
 
     def _smooth_normals(self) -> mi.Float:
         """(3 V,) unit normals, as smooth as the other values at the vertices."""

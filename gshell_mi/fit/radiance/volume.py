@@ -1,4 +1,4 @@
-"""A radiance volume: where is something, where is nothing?
+"""A radiance volume in sparse voxels: which windows, struts and gaps does no hull show?
 
 A surface that starts at the visual hull and moves locally never finds windows, struts or the gaps between
 leaves. A fog has no such start: it thins wherever the views disagree and thickens where they agree

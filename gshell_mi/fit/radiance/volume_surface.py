@@ -14,7 +14,6 @@ from ...fields.lattice_fields import closed_at_border
 from ...fields.visual_hull import visual_hull
 from ...lattice import Lattice
 from ...scene import FitScene
-from ...template.msdf import splat_to_lattice
 from ...template.sides import normals_at_vertices
 from ..surface import Seen, Surface
 from ..template import closed_template
@@ -83,8 +82,7 @@ def volume_surface(
     mesh, vertices, faces = closed_template(subject, sdf, lattice)
     # What it shows is where it is.
     inside = vertices - margin * cell * normals_at_vertices(vertices, faces)
-    radiance, known = splat_to_lattice(mi.Float(volume.radiance_at(inside).ravel()), mesh, lattice)
-    seen = Seen(radiance.numpy().reshape(-1, 3), known.numpy(), light)
+    seen = Seen.on(lattice, mesh, volume.radiance_at(inside), light)
     return Surface(LatticeFields.closed(sdf, lattice.grid), seen=seen)
 
 

@@ -12,7 +12,7 @@ from typing import Annotated
 
 from ..bounds import Between
 from ..carving.carving import carve
-from ..carving.radiance_volume import RadianceVolume
+from ..carving.density_grid import DensityGrid
 from ..carving.vessels import hollowed_vessels
 from ..runner import Steps
 from ..stage import Fit
@@ -54,7 +54,7 @@ class Cavities:
             surface = hollowed or surface
         if cubes and count:
             _, vertices, faces = closed_template(fit.scene.subject, surface.hull, lattice)
-            volume = RadianceVolume(
+            volume = DensityGrid(
                 surface.hull.reshape((lattice.stride,) * 3),
                 vertices,
                 faces,

@@ -26,7 +26,7 @@ from ..joint.joint import JointStage
 from ..runner import Steps
 from ..sheets import with_open_sheets
 from ..stage import Fit
-from ..surface import TYPICAL_REFLECTANCE, Surface
+from ..surface import TYPICAL_REFLECTANCE, Surface, under
 from ..unseen import without_unseen_parts
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def start_fields(
         band_resolution: cells per side from which on blocks are stored.
         kept: where a stage goes on, its ``block_arrays`` are the fields.
     """
-    if stored := _under(kept, _BLOCKS):
+    if stored := under(kept, _BLOCKS):
         return LatticeFields(**stored, grid=lattice.grid, block_resolution=lattice.resolution)
     fields = surface.on_grid(lattice.grid).fields
     if fields.blocks is not None and fields.lattice.resolution == lattice.resolution:
@@ -228,7 +228,3 @@ def start_light(scene: FitScene, surface: Surface, config: FitConfig) -> Environ
 
 def _prefixed(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {prefix + name: array for name, array in arrays.items()}
-
-
-def _under(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

@@ -22,7 +22,7 @@ from ...images import decibels
 from ...means import mean
 from ...pixels import FAINT
 from ...schedules import decay_at
-from ...template.msdf import clean_opacity, msdf_from_template, splat_to_lattice
+from ...template.msdf import clean_opacity, msdf_from_template
 from ...template.sides import opposite_sides
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
@@ -112,8 +112,7 @@ class Openings:
             appearance.refit(~opened)
         front, _ = appearance.radiance()
         msdf = msdf_from_template(logits, template.mesh, surface.lattice)
-        radiance, known = splat_to_lattice(mi.Float(front.ravel()), template.mesh, surface.lattice)
-        seen = Seen(radiance.numpy().reshape(-1, 3), known.numpy(), Seen.even_light(front[~opened]))
+        seen = Seen.on(surface.lattice, template.mesh, front, Seen.even_light(front[~opened]))
         return replace(surface.with_fields(msdf=msdf.numpy()), seen=seen)
 
 

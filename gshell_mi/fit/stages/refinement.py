@@ -14,6 +14,7 @@ import numpy as np
 
 from ...template.outlines import Outlines
 from ...triangles import positive_part
+from ..radiance.on_template import radiance_on
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..refinement.early_stopping import EarlyStopping
 from ..refinement.refinement import PhotometricRefinement
@@ -76,28 +77,18 @@ class Refinement:
             return surface
         steps.fact(f"{self.name}_kept", False)
         template = template_of(fit.scene.subject, surface)
-        start, judge = template.start, fit.held_out_judge
-        appearance = SurfaceRadiance(
-            start,
-            template.faces,
-            fit.views,
-            fit.training,
-            fit.config.radiance,
-            seed=fit.config.seed,
-            mirrored=judge.shown(template.surface).mirrored,
-        )
+        start, appearance = template.start, radiance_on(template, fit)
         if self.first:
-            appearance.move(mi.Float(start.ravel()))
             appearance.refit_anew(template.solid)
         else:
             start = surface.moved[0].positions
-            appearance.take_over(start, surface.moved[0].fitted, template.solid)
+            appearance.take_over(start, surface.moved[0].fitted)
         after = self._moved(appearance, template, start, fit, steps, fit.cell(surface))
         if after is None:
             return surface
         with steps.task("verdict"):
             meshes = [positive_part(at, template.faces, template.logits) for at in (start, after.positions)]
-            verdict, unseen = (judge.decide(*meshes) for judge in (fit.judge, fit.held_out_judge))
+            verdict, unseen = (judge.decide(*meshes) for judge in (fit.judge, fit.validation_judge))
         steps.fact(f"{self.name}_verdict", verdict.facts() | {"unseen_gain": round(float(unseen.gain[0]), 5)})
         # All views tell whether it is more than noise; those it was not fitted to, that it is no gloss.
         accepted = verdict.accepted[0] and unseen.gain[0] > 0

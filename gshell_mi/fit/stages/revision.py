@@ -21,19 +21,14 @@ from ...template.sides import opposite_sides
 from ...topology import lobes
 from ...triangles import positive_part
 from ..judge import Judge, places_of
-from ..radiance.acceptance import WORST, close_rejected, close_shallow
+from ..radiance.acceptance import CLOSINGS, WORST, close_rejected, close_shallow
 from ..radiance.shown import Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
+from ..sheets import SURE
 from ..stage import Fit
 from ..surface import Surface
 from .openings import OpacityTraining, OpeningsConfig, justified
-
-#: Openings that close one after the other, before all others that are rejected do.
-_CLOSINGS = 7
-
-#: Size of the mSDF of what has closed, at least, in cells.
-_SURE = 0.5
 
 #: Standard errors by which an opening has to explain more than a cap: half of what it takes to open one. A
 #: false slit below the chair's rail has from -2.0 to 3.7, from fit to fit; true openings have 1.9 to 13.
@@ -99,7 +94,7 @@ class Revision:
         points = mi.Transform4f(fit.scene.subject.to_world) @ mi.Point3f(lattice.points(mi.Float))
         sdf, told = put_in_place(fields.sdf / lattice.spacing, points.numpy().T, moved, faces, capped, cell)
         sdf = (lattice.spacing * sdf).astype(np.float32)
-        msdf = np.where(told, np.maximum(np.abs(msdf), _SURE * lattice.spacing), msdf).astype(np.float32)
+        msdf = np.where(told, np.maximum(np.abs(msdf), SURE * lattice.spacing), msdf).astype(np.float32)
         return replace(surface.with_fields(sdf=sdf, msdf=msdf), settled=False)
 
 
@@ -121,7 +116,7 @@ def _closed(judge: Judge, template: Shown, values: np.ndarray, opposite: np.ndar
         (V,) values, those of closed openings negated.
     """
     thin = opposite >= 0
-    for closing in reversed(range(_CLOSINGS)):
+    for closing in reversed(range(CLOSINGS)):
         chosen = values <= 0
         if not chosen.any():
             break

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from gshell_mi.fit.carving import carving
 from gshell_mi.fit.carving.carving import carve
-from gshell_mi.fit.carving.radiance_volume import RadianceVolume
+from gshell_mi.fit.carving.density_grid import DensityGrid
 from gshell_mi.fit.template import template_of
 from gshell_mi.lattice import make_lattice
 
@@ -29,7 +29,7 @@ def trained():
     def run(shape, **fields):
         if shape not in volumes:
             fit = fit_of(subject, shape())
-            volume = RadianceVolume(
+            volume = DensityGrid(
                 hull, vertices, faces, subject.to_world, fit.views, fit.training, CONFIG.cavities
             )
             for step in range(CONFIG.cavities.iterations):

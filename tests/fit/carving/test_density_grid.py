@@ -7,8 +7,8 @@ import pytest
 from cup import CONFIG, capture, hull_of
 
 from gshell_mi.fit.bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
-from gshell_mi.fit.carving import radiance_volume
-from gshell_mi.fit.carving.radiance_volume import RadianceVolume
+from gshell_mi.fit.carving import density_grid
+from gshell_mi.fit.carving.density_grid import DensityGrid
 
 
 @pytest.fixture(scope="module")
@@ -19,9 +19,7 @@ def seen():
 def make(seen, first=0):
     views, pixels, _ = seen
     hull, vertices, faces = hull_of(32)
-    return RadianceVolume(
-        hull, vertices, faces, mi.ScalarTransform4f(), views, pixels, CONFIG.cavities, first
-    )
+    return DensityGrid(hull, vertices, faces, mi.ScalarTransform4f(), views, pixels, CONFIG.cavities, first)
 
 
 def march(volume, rays, **options):
@@ -31,9 +29,7 @@ def march(volume, rays, **options):
 def test_no_ray_meets_the_hull(seen):
     views, pixels, _ = seen
     hull, vertices, faces = hull_of(32)
-    volume = RadianceVolume(
-        hull, vertices + 50, faces, mi.ScalarTransform4f(), views, pixels, CONFIG.cavities
-    )
+    volume = DensityGrid(hull, vertices + 50, faces, mi.ScalarTransform4f(), views, pixels, CONFIG.cavities)
     before = volume.opacity()
     assert np.isfinite(list(volume.step(0).values())).all()
     np.testing.assert_array_equal(volume.opacity(), before)
@@ -46,7 +42,7 @@ def test_even_fog_absorbs_exponentially(seen):
     origin = mi.Point3f(0, 0, -0.3)
     rays = origin, mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0.6)
     radiance, transmittance = march(volume, rays)
-    depth = np.log1p(np.exp(radiance_volume._FOG))  # of a cell
+    depth = np.log1p(np.exp(density_grid._FOG))  # of a cell
     steps = np.ceil(0.6 / (0.5 * 2 / volume.resolution))
     assert transmittance[0] == pytest.approx(np.exp(-0.5 * steps * depth), rel=1e-3)
     assert radiance.x[0] == pytest.approx(volume.mean_radiance * (1 - transmittance[0]), rel=1e-3)

@@ -1,4 +1,4 @@
-"""A volume of density and radiance inside the visual hull: where is something, where is nothing?
+"""A dense grid of density and radiance inside the visual hull: where is something, where is nothing?
 
 A surface that starts at the hull sinks into a fold only where a small step already explains the images
 better, so deep pleats and keyholes stay bridged. A fog has no such start: it thins wherever the views
@@ -53,7 +53,7 @@ _SURVEY_STEP = 1 << 20
 _JITTER = 1 << 30
 
 
-class RadianceVolume:
+class DensityGrid:
     """Density and radiance at lattice vertices, trained on random pixels.
 
     Rays pick one of the eight vertices around each sample at random, by the weights of the trilinear
