@@ -204,19 +204,22 @@ def test_interrupted_by_the_user(bowl_scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_and_resumed(bowl_scene, tmp_path):
-    """Killed once in each stage, the fit takes the steps that it would have taken."""
+@pytest.mark.parametrize(
+    ("options", "kills", "first_joint_steps"),
+    [
+        ((), (("openings", 30), ("cavities", 5), ("refinement", 3), ("joint", 1), ("texture", 2)), 0.2),
+        (("--refinement.iterations", "0"), (("joint", 1),), 1e-3),
+    ],
+    ids=["each stage", "joint"],
+)
+def test_killed_and_resumed(bowl_scene, tmp_path, options, kills, first_joint_steps):
+    """Killed once in some stages, the fit takes the steps that it would have taken."""
     # Which vertices a revision opens is a choice, and rounding alone leads to another one.
-    options = "--openings.no-revise", "--texture.rounds", "1"
+    options = *options, "--openings.no-revise", "--texture.rounds", "1"
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert fit(bowl_scene, whole, *options) == 0
-    for stage, iteration, resume in (
-        ("openings", 30, ()),
-        ("cavities", 5, ("--resume",)),
-        ("refinement", 3, ("--resume",)),
-        ("joint", 1, ("--resume",)),
-        ("texture", 2, ("--resume",)),
-    ):
+    for stage, iteration in kills:
+        resume = ["--resume"] if killed.exists() else []
         process = start(bowl_scene, killed, "--checkpoint-seconds", "0.05", *options, *resume)
         wait_for_step(process, killed, stage, iteration)
         process.kill()
@@ -228,11 +231,13 @@ def test_killed_and_resumed(bowl_scene, tmp_path):
 
     # Sums over threads depend on their order, and rounding that turns the sign of a residual turns its L1
     # gradient. Where vertices move, differences grow tenfold with every step. Two whole runs agree to 1e-5
-    # before; to 2 % in the refinement; in the joint stage to 1e-4 at first, a few per cent at the end.
+    # before; to 2 % in the refinement, and then to a per cent where another edge of the lattice is crossed; in
+    # the joint stage without refinement to 1e-4 at first, a few per cent at the end.
     expected, found = (np.array([step["loss"] for step in log(output)]) for output in (whole, killed))
     tolerance = {"openings": 1e-3, "cavities": 1e-3, "refinement": 0.06, "joint": 0.2, "texture": 0.2}
     allowed = [
-        1e-3 if stage == "joint" and iteration <= 2 else tolerance[stage] for stage, iteration in steps(whole)
+        first_joint_steps if stage == "joint" and iteration <= 2 else tolerance[stage]
+        for stage, iteration in steps(whole)
     ]
     np.testing.assert_array_less(np.abs(found / expected - 1), allowed)
 
