@@ -231,8 +231,8 @@ def test_killed_and_resumed(bowl_scene, tmp_path, options, kills, first_joint_st
 
     # Sums over threads depend on their order, and rounding that turns the sign of a residual turns its L1
     # gradient. Where vertices move, differences grow tenfold with every step. Two whole runs agree to 1e-5
-    # before; to 2 % in the refinement, and then to a per cent where another edge of the lattice is crossed; in
-    # the joint stage without refinement to 1e-4 at first, a few per cent at the end.
+    # before; to 2 % in the refinement, and to a per cent afterwards if other edges are crossed;
+    # in the joint stage without refinement to 1e-4 at first, a few per cent at the end.
     expected, found = (np.array([step["loss"] for step in log(output)]) for output in (whole, killed))
     tolerance = {"openings": 1e-3, "cavities": 1e-3, "refinement": 0.06, "joint": 0.2, "texture": 0.2}
     allowed = [
