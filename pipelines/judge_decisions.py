@@ -27,6 +27,7 @@ from scipy.spatial import cKDTree
 REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(REPOSITORY / "pipelines"), str(REPOSITORY)]
 
+from fit_study.command import add_scene_arguments  # noqa: E402
 from fit_study.settings import parsed_settings  # noqa: E402
 
 from gshell_mi.doctor import ensure_variant  # noqa: E402
@@ -338,22 +339,7 @@ def main(given: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "scenes",
-        nargs="*",
-        type=Path,
-        default=SCENES,
-        metavar="SCENE.xml",
-        help=f"default: {', '.join(scene.stem for scene in SCENES)}",
-    )
-    parser.add_argument(
-        "--set",
-        nargs="+",
-        default=[],
-        metavar="NAME=VALUE",
-        dest="settings",
-        help="settings of the fits instead of the defaults",
-    )
+    add_scene_arguments(parser, SCENES)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/judge"), help="folder of the outcomes")
     parser.add_argument(
         "--page", type=Path, default=REPOSITORY / "docs" / "judge.md", help="the Markdown file to write"

@@ -32,7 +32,7 @@ class ScriptedJudge:
             np.bincount(label[told], self.error(opaque)[told]) / number for opaque in (before, after)
         )
         gain = np.log(np.maximum(first, 1e-9) / np.maximum(second, 1e-9))
-        return Verdict(first, second, gain[None], np.full((1, len(gain)), self.noise))
+        return Verdict(first, second, gain, np.full(len(gain), self.noise))
 
 
 class ScriptedTemplate:

@@ -44,37 +44,19 @@ class Verdict:
 
     Attributes:
         before, after: (P,) mean error of a ray.
-        gains: (S, P) mean, over the unseen views, of the logarithm of the error before over that after, at
-            each of S scales: what is dark, or seen by some views far better than by others, counts as much as
-            the rest.
-        noises: (S, P) standard errors of the gains; infinite where hardly a view tells. Views are independent
-            of each other, rays of one view are not.
+        gain: (P,) mean, over the unseen views, of the logarithm of the error before over that after, at the
+            scale that tells more: what is dark, or seen by some views far better than by others, counts as
+            much as the rest.
+        noise: (P,) standard error of the gain; infinite where hardly a view tells. Views are independent of
+            each other, rays of one view are not.
         rejected: how many more places of the same proposal were rejected before.
     """
 
     before: np.ndarray
     after: np.ndarray
-    gains: np.ndarray
-    noises: np.ndarray
+    gain: np.ndarray
+    noise: np.ndarray
     rejected: int = 0
-
-    @property
-    def scores(self) -> np.ndarray:
-        """(S, P) gains in standard errors; 0 where hardly a view tells."""
-        return self.gains / self.noises
-
-    @property
-    def gain(self) -> np.ndarray:
-        """(P,) at the scale that tells more."""
-        return self._telling(self.gains)
-
-    @property
-    def noise(self) -> np.ndarray:
-        """(P,) at the scale that tells more."""
-        return self._telling(self.noises)
-
-    def _telling(self, values: np.ndarray) -> np.ndarray:
-        return np.take_along_axis(values, np.argmax(np.abs(self.scores), axis=0)[None], axis=0)[0]
 
     @property
     def accepted(self) -> np.ndarray:
@@ -304,9 +286,12 @@ def verdict_of(rays: np.ndarray, before: np.ndarray, after: np.ndarray) -> Verdi
     per_ray = np.maximum(rays, 1)
     change = np.log((before / per_ray + _EXACT) / (after / per_ray + _EXACT))
     voices = np.maximum(weight.sum(axis=1), 1e-12)
-    gains = (weight * change).sum(axis=-1) / voices
-    spread = (weight**2 * (change - gains[..., None]) ** 2).sum(axis=-1)
-    noises = np.sqrt(spread * seen / np.maximum(seen - 1, 1)) / voices + _ROUNDED
-    noises[:, seen < _VIEWS] = np.inf
+    gain = (weight * change).sum(axis=-1) / voices
+    spread = (weight**2 * (change - gain[..., None]) ** 2).sum(axis=-1)
+    noise = np.sqrt(spread * seen / np.maximum(seen - 1, 1)) / voices + _ROUNDED
+    noise[:, seen < _VIEWS] = np.inf
+    # The scale that tells more of a place speaks for it.
+    scale = np.argmax(np.abs(gain) / noise, axis=0)[None]
+    gain, noise = (np.take_along_axis(values, scale, axis=0)[0] for values in (gain, noise))
     per_ray = np.maximum(total, 1)
-    return Verdict(before[0].sum(axis=1) / per_ray, after[0].sum(axis=1) / per_ray, gains, noises)
+    return Verdict(before[0].sum(axis=1) / per_ray, after[0].sum(axis=1) / per_ray, gain, noise)

@@ -45,12 +45,9 @@ class Seen:
     light: np.float32
 
     @classmethod
-    def on(
-        cls, lattice: Lattice, template: SurfaceMesh, radiance: np.ndarray, light: np.float32 | None = None
-    ) -> Seen:
-        """From (V, 3) radiance of a template's vertices; by default under the light that explains it."""
+    def on(cls, lattice: Lattice, template: SurfaceMesh, radiance: np.ndarray, light: np.float32) -> Seen:
+        """From (V, 3) radiance of a template's vertices."""
         spread, known = splat_to_lattice(mi.Float(radiance.ravel()), template, lattice)
-        light = cls.even_light(radiance) if light is None else light
         return cls(spread.numpy().reshape(-1, 3), known.numpy(), light)
 
     @staticmethod

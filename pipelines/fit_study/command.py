@@ -22,6 +22,17 @@ def add_common_arguments(
     parser: argparse.ArgumentParser, scenes: list[Path], output: str, page: Path
 ) -> None:
     """Scenes, shared settings and where things are written; what follows the parser are defaults."""
+    add_scene_arguments(parser, scenes)
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path(output), help="folder of the fits and their scores"
+    )
+    parser.add_argument("--page", type=Path, default=page, help="the Markdown file to write")
+    parser.add_argument("--page-only", action="store_true", help="make no fit, write what there is")
+    parser.add_argument("--bars", action="store_true", help="show the progress of every stage of every fit")
+
+
+def add_scene_arguments(parser: argparse.ArgumentParser, scenes: list[Path]) -> None:
+    """Scenes, by default these, and settings that their fits share."""
     parser.add_argument(
         "scenes",
         nargs="*",
@@ -38,12 +49,6 @@ def add_common_arguments(
         dest="settings",
         help="settings of all fits instead of the defaults",
     )
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path(output), help="folder of the fits and their scores"
-    )
-    parser.add_argument("--page", type=Path, default=page, help="the Markdown file to write")
-    parser.add_argument("--page-only", action="store_true", help="make no fit, write what there is")
-    parser.add_argument("--bars", action="store_true", help="show the progress of every stage of every fit")
 
 
 def run_study(arguments: argparse.Namespace, trials: Callable[[FitConfig], list[Trial]], page: Page) -> int:

@@ -28,7 +28,7 @@ def decisions(monkeypatch):
         if len(self.splits) > 1:
             last = said.pop(0)
         # Those that the refinement has not seen say the same.
-        return Verdict(np.ones(1), np.ones(1), np.array([[1.0 if last else -1.0]]), np.array([[0.1]]))
+        return Verdict(np.ones(1), np.ones(1), np.array([1.0 if last else -1.0]), np.array([0.1]))
 
     monkeypatch.setattr(Judge, "decide", decide)
     return lambda *accepted: said.extend(accepted)

@@ -96,7 +96,7 @@ def test_few_views_are_not_enough():
 
 def _told(z: list[float], rejected: int = 0) -> list[bool]:
     gain = 0.1 * np.array(z)
-    return Verdict(gain, gain, gain[None], np.full((1, len(z)), 0.1), rejected).accepted.tolist()
+    return Verdict(gain, gain, gain, np.full(len(z), 0.1), rejected).accepted.tolist()
 
 
 def test_of_many_places_the_best_by_chance_is_not_accepted():
@@ -118,4 +118,4 @@ def test_many_places_that_are_all_better_are_all_accepted():
 
 def test_a_place_that_hardly_a_view_tells_of_makes_others_no_less_sure():
     gain, noise = np.array([0.21] + 30 * [0.0]), np.array([0.1] + 30 * [np.inf])
-    assert Verdict(gain, gain, gain[None], noise[None]).accepted.tolist() == [True] + 30 * [False]
+    assert Verdict(gain, gain, gain, noise).accepted.tolist() == [True] + 30 * [False]

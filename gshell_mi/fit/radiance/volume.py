@@ -230,7 +230,7 @@ class RadianceVolume:
         greatest, packets = dr.zeros(mi.Float, self.bricks.voxel_count), self._packets()
         for batch in range(_SURVEY):
             rays, _, _ = self._rays(_SURVEY_STEP + batch)
-            composite(self.bricks, packets, rays, _SURVEY_STEP + batch, greatest=greatest)
+            composite(self.bricks, packets, rays, self._seed_of(_SURVEY_STEP + batch), greatest=greatest)
             dr.eval(greatest)
         return greatest.numpy()
 

@@ -126,7 +126,7 @@ def test_what_a_dent_explains_as_well_does_not_open(fit, hull, monkeypatch):
         if before.shown is after.shown or where is not after.shown:
             return verdict
         asked.append(float(verdict.gain[0]))
-        return replace(verdict, gains=-np.abs(verdict.gains))
+        return replace(verdict, gain=-np.abs(verdict.gain))
 
     monkeypatch.setattr(Judge, "compare", compare)
     _, changed = revised(fit, hull)
