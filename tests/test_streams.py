@@ -133,7 +133,29 @@ def test_it_works_from_the_first_second_on(bowl_scene, tmp_path, loading, share)
     assert "Traceback" not in told and "Interrupted" in told
 
 
+INTERRUPT_WHEN_DRJIT_LOADS = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "drjit":
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+"""
+
+
 @pytest.mark.parametrize("command", ["capture", "export", "turntable", "report", "compare", "doctor"])
-def test_every_command_stops_while_it_loads(command, tmp_path, loading):
-    code, told = interrupted([f"gshell_mi.{command}", str(tmp_path)], 0.4 * loading)
-    assert (code, told) == (130, "Interrupted.\n")
+def test_every_command_stops_while_it_loads(command, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(INTERRUPT_WHEN_DRJIT_LOADS)
+    paths = [str(tmp_path), str(Path.cwd()), os.environ.get("PYTHONPATH", "")]
+    found = run(
+        f"gshell_mi.{command}",
+        str(tmp_path),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    assert (found.returncode, found.stderr) == (130, "Interrupted.\n")
