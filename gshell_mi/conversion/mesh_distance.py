@@ -42,18 +42,22 @@ def _find_nearest(
     high = np.floor((triangles.max(axis=1) + reach - grid.origin) / grid.spacing)
     high = high.clip(max=grid.stride - 1).astype(int)
     size = np.maximum(high - low + 1, 0)
-    pairs = size.prod(axis=1)
-    corners = [mi.Point3f(np.ascontiguousarray(triangles[:, i].T, np.float32)) for i in range(3)]
-    first = np.concatenate([[0], np.cumsum(pairs)])
+    first = np.concatenate([[0], np.cumsum(size.prod(axis=1))])
+    corners = _corners(triangles)
+    lows, sizes = (mi.Point3u(np.ascontiguousarray(part.T, np.uint32)) for part in (low, size))
     start = 0
     while start < len(triangles):
         stop = max(np.searchsorted(first, first[start] + _PAIRS, side="right") - 1, start + 1)
-        face = np.repeat(np.arange(start, stop), pairs[start:stop])
-        index = np.arange(len(face)) - np.repeat(first[start:stop] - first[start], pairs[start:stop])
-        x, index = index % size[face, 0] + low[face, 0], index // size[face, 0]
-        y, z = index % size[face, 1] + low[face, 1], index // size[face, 1] + low[face, 2]
-        vertex = mi.UInt32((grid.first + x + grid.stride * (y + grid.stride * z)).astype(np.uint32))
-        owner = mi.UInt32(face.astype(np.uint32))
+        begins = mi.UInt32(((first[:-1] - first[start]) % 2**32).astype(np.uint32))
+        owners = np.repeat(np.arange(start, stop, dtype=np.uint32), np.diff(first[start : stop + 1]))
+        owner = mi.UInt32(owners)
+        index = dr.arange(mi.UInt32, len(owners)) - dr.gather(mi.UInt32, begins, owner)
+        # The lanes that fill the last vector up must not divide by 0.
+        box = dr.maximum(dr.gather(mi.Point3u, sizes, owner), 1)
+        row = index // box.x
+        step = mi.Point3u(index - row * box.x, row % box.y, row // box.y)
+        x, y, z = dr.gather(mi.Point3u, lows, owner) + step
+        vertex = grid.first + x + grid.stride * (y + grid.stride * z)
         a, b, c = (dr.gather(mi.Point3f, corner, owner) for corner in corners)
         point = mi.Point3f(lattice.positions_of(vertex, mi.Float))
         distance = _squared_distance(mi.Vector3f(point - a), mi.Vector3f(b - a), mi.Vector3f(c - a))
@@ -62,6 +66,30 @@ def _find_nearest(
         dr.scatter_reduce(dr.ReduceOp.Min, best, key, vertex, near, dr.ReduceMode.Local)
         dr.eval(best)
         start = stop
+
+
+def _nearest_of(mesh: trimesh.Trimesh, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Which of its k faces, (n, k), is nearest to each point."""
+    if faces.shape[1] == 1:
+        return faces[:, 0]
+    import mitsuba as mi
+
+    corners = _corners(mesh.triangles)
+    point = mi.Point3f(np.ascontiguousarray(points.T, np.float32))
+    least, nearest = dr.full(mi.Float, dr.inf, len(points)), dr.zeros(mi.UInt32, len(points))
+    for column in faces.T:
+        owner = mi.UInt32(np.ascontiguousarray(column, np.uint32))
+        a, b, c = (dr.gather(mi.Point3f, corner, owner) for corner in corners)
+        distance = _squared_distance(mi.Vector3f(point - a), mi.Vector3f(b - a), mi.Vector3f(c - a))
+        nearest = dr.select(distance < least, owner, nearest)
+        least = dr.minimum(least, distance)
+    return nearest.numpy().astype(np.int64)
+
+
+def _corners(triangles: np.ndarray) -> list[Array3f]:
+    import mitsuba as mi
+
+    return [mi.Point3f(np.ascontiguousarray(triangles[:, i].T, np.float32)) for i in range(3)]
 
 
 def _squared_distance(p: Array3f, u: Array3f, v: Array3f) -> Float:
@@ -116,14 +144,9 @@ class MeshFeet:
 
     def __call__(self, points: np.ndarray, faces: np.ndarray) -> Feet:
         """The feet of (n, 3) points, the nearest face being among the (n, k) given ones."""
-        mesh, count = self.mesh, faces.shape[1]
-        triangles = mesh.triangles[faces.ravel()]
-        feet = trimesh.triangles.closest_point(triangles, np.repeat(points, count, axis=0))
-        feet = feet.reshape(-1, count, 3)
-        best = np.linalg.norm(feet - points[:, None], axis=2).argmin(axis=1)
-        rows = np.arange(len(points))
-        foot, face = feet[rows, best], faces[rows, best]
-
+        mesh = self.mesh
+        face = _nearest_of(mesh, points, faces)
+        foot = trimesh.triangles.closest_point(mesh.triangles[face], points)
         weights = trimesh.triangles.points_to_barycentric(mesh.triangles[face], foot)
         vanishing = weights < 1e-5
         normal = mesh.face_normals[face].copy()

@@ -16,6 +16,7 @@ from ..evaluation.scores_file import check_scores_file, write_scores
 
 _MEANINGS = {
     "mmd": "mean distance from a true shape to the nearest sample",
+    "mmd_boundary": "the same of points along their boundaries",
     "coverage": "true shapes that are nearest to some sample",
     "nearest_neighbour_accuracy": "0.5: nothing tells samples from true shapes",
     "jsd": "divergence of where points lie, in bits",
@@ -23,6 +24,7 @@ _MEANINGS = {
     "nearest_training_of_true": "the same of held-out shapes: much less above is memory",
     "loops_as_class": "samples with as many loops as some object of their class",
     "one_component": "samples in one piece",
+    "self_intersecting": "samples that go through themselves",
 }
 
 
@@ -40,6 +42,8 @@ class _Arguments:
     """File for the scores; one of an earlier evaluation is replaced."""
     quiet: bool = False
     """No progress bar."""
+    variant: str = "llvm_ad_rgb"
+    """Mitsuba variant: llvm_ad_rgb (CPU) or cuda_ad_rgb (NVIDIA GPU)."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -50,6 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _evaluate(given: _Arguments) -> None:
+    from ..doctor import ensure_variant
     from ..generation.data_set import DataSet
     from ..generation.evaluated import evaluate, read_samples
 
@@ -62,6 +67,7 @@ def _evaluate(given: _Arguments) -> None:
     if given.json:
         check_scores_file(given.json)
     data = DataSet.open(given.data_set)
+    ensure_variant(given.variant)
     scores = evaluate(
         read_samples(given.samples, given.points), data, points=given.points, emd=given.emd, quiet=given.quiet
     )

@@ -130,13 +130,31 @@ class DataSet:
             chosen = [i for i, record in enumerate(shard.records) if record.held_out == held_out]
             records += [shard.records[i] for i in chosen]
             parts.append((shard.sdf[chosen], shard.msdf[chosen], shard.points[chosen]))
+        self._check_some(records, held_out=held_out)
+        sdf, msdf, points = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        return records, sdf, msdf, points
+
+    def load_points(self, *, held_out: bool) -> tuple[list[Record], np.ndarray]:
+        """Records and points (n, 2048, 3) float16 of one split, without the fields.
+
+        Raises:
+            UserError: there are none, or a shard is damaged.
+        """
+        records, parts = [], []
+        for number in range(self.config["shards"]):
+            found, points = read_points(self.shard_path(number))
+            chosen = [i for i, record in enumerate(found) if record.held_out == held_out]
+            records += [found[i] for i in chosen]
+            parts.append(points[chosen])
+        self._check_some(records, held_out=held_out)
+        return records, np.concatenate(parts)
+
+    def _check_some(self, records: list[Record], *, held_out: bool) -> None:
         if not records:
             split = "held-out" if held_out else "training"
             raise UserError(
                 f"'{self.path}' has no {split} objects; make a larger set, or another --held-out."
             )
-        sdf, msdf, points = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        return records, sdf, msdf, points
 
 
 def write_config(folder: OwnFolder, config: dict) -> None:
@@ -185,6 +203,18 @@ def read_records(path: Path) -> list[Record]:
             return _records(archive)
     except Exception as error:  # NumPy's readers raise whatever they stumble over
         raise _damaged(path, error) from error
+
+
+def read_points(path: Path) -> tuple[list[Record], np.ndarray]:
+    """A shard's records and points, without its fields. Raises ``UserError`` if it is damaged."""
+    try:
+        with np.load(path) as archive:
+            records, points = _records(archive), archive["points"]
+            if points.shape != (len(records), POINTS, 3):
+                raise ValueError(f"points of shape {points.shape}")
+    except Exception as error:  # NumPy's readers raise whatever they stumble over
+        raise _damaged(path, error) from error
+    return records, points
 
 
 def _records(archive) -> list[Record]:

@@ -12,18 +12,24 @@ from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from ..bars import Bars
 from ..errors import UserError
 from ..evaluation.mesh_scores import read_mesh
+from ..evaluation.self_intersections import piercing_edges
 from ..json_files import read_json_object
 from ..own_folder import OwnFolder
 from .data_set import DataSet, Record
+from .fields import TruncatedFields
 from .set_scores import (
     chamfer_distances,
     coverage,
     earth_movers_distances,
     jensen_shannon_divergence,
     minimum_matching_distance,
+    nearest_chamfer_distances,
     nearest_neighbour_accuracy,
 )
-from .surface_points import surface_points
+from .surface_points import rim_points, surface_points
+
+#: Points along the boundary of a shape.
+_RIM_POINTS = 256
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,10 @@ class Samples:
     kinds: list[str]
     loops: list[int]
     components: list[int]
+    rims: list[np.ndarray]
+    """Points along the boundary of each, (p, 3) or (0, 3)."""
+    piercing: list[int]
+    """Edges of each that go through one of its own faces."""
     empty: int
     """Meshes without faces, left out of the rest."""
     seconds: float | None
@@ -42,7 +52,7 @@ class Samples:
 
 
 def read_samples(folder: Path, points: int) -> Samples:
-    """The meshes that ``python -m gshell_mi.generate`` wrote into a folder.
+    """The meshes that ``python -m gshell_mi.generate`` wrote into a folder. Needs a Mitsuba variant.
 
     Raises:
         UserError: it is no such folder, or its files are damaged.
@@ -67,12 +77,14 @@ def read_samples(folder: Path, points: int) -> Samples:
     full = [row for row in rows if row[4] > 0]
     if not full:
         raise UserError(f"All samples in '{folder}' are empty; train the model for longer.")
-    found = [surface_points(read_mesh(folder / row[0]), points, i)[0] for i, row in enumerate(full)]
+    meshes = [read_mesh(folder / row[0]) for row in full]
     return Samples(
-        np.array(found),
+        np.array([surface_points(mesh, points, i)[0] for i, mesh in enumerate(meshes)]),
         [row[1] for row in full],
         [row[2] for row in full],
         [row[3] for row in full],
+        [rim_points(mesh, _RIM_POINTS, i) for i, mesh in enumerate(meshes)],
+        [len(piercing_edges(np.asarray(mesh.vertices), np.asarray(mesh.faces))) for mesh in meshes],
         len(rows) - len(full),
         seconds,
     )
@@ -81,7 +93,7 @@ def read_samples(folder: Path, points: int) -> Samples:
 def evaluate(
     samples: Samples, data: DataSet, *, points: int = 512, emd: int = 32, quiet: bool = True
 ) -> dict:
-    """Scores of samples against the held-out objects of a data set.
+    """Scores of samples against the held-out objects of a data set. Needs a Mitsuba variant.
 
     Distances are of the cube [-1, 1]^3, in which both lie. Both sets are cut to the size of the smaller. The
     classes in turn are compared, so that both have the same share of each, as far as they can.
@@ -90,8 +102,8 @@ def evaluate(
         points: of each shape, for the chamfer distances.
         emd: shapes of each set for the earth mover's distance, of 128 points each; 0 for none.
     """
-    true_records, _, _, true_points = data.load(held_out=True)
-    train_records, _, _, train_points = data.load(held_out=False)
+    true_records, sdf, msdf, true_points = data.load(held_out=True)
+    train_records, train_points = data.load_points(held_out=False)
     mine, theirs = _paired(samples.kinds, [record.kind for record in true_records])
     a = samples.points[mine, :points].astype(np.float32)
     b = true_points[theirs, :points].astype(np.float32)
@@ -109,9 +121,8 @@ def evaluate(
             progress.advance(bar)
 
         between = chamfer_distances(a, b, advance)
-        among_a, among_b = chamfer_distances(a, a, advance), chamfer_distances(b, b, advance)
-        to_trained = chamfer_distances(a, trained, advance)
-        true_to_trained = chamfer_distances(b, trained, advance)
+        among_a, among_b = (chamfer_distances(of, told=advance) for of in (a, b))
+        to_trained, true_to_trained = (nearest_chamfer_distances(of, trained, told=advance) for of in (a, b))
     scores = {
         "samples": len(a),
         "true": len(b),
@@ -119,9 +130,19 @@ def evaluate(
         "coverage": coverage(between),
         "nearest_neighbour_accuracy": nearest_neighbour_accuracy(among_a, between, among_b),
         "jsd": jensen_shannon_divergence(a, b),
-        "nearest_training": float(to_trained.min(axis=1).mean()),
-        "nearest_training_of_true": float(true_to_trained.min(axis=1).mean()),
+        "nearest_training": float(to_trained.mean()),
+        "nearest_training_of_true": float(true_to_trained.mean()),
     }
+    rims = [samples.rims[i] for i in mine if len(samples.rims[i])]
+    true_rims = [
+        rim_points(
+            TruncatedFields(sdf[i].astype(np.float32), msdf[i].astype(np.float32)).surface(), _RIM_POINTS
+        )
+        for i in theirs
+    ]
+    true_rims = [rim for rim in true_rims if len(rim)]
+    if rims and true_rims:
+        scores["mmd_boundary"] = minimum_matching_distance(chamfer_distances(rims, true_rims))
     if emd:
         a, b = a[:emd, :128], b[:emd, :128]
         moved = earth_movers_distances(a, b)
@@ -140,7 +161,7 @@ def evaluate(
 
 
 def _topology(samples: Samples, records: list[Record]) -> dict:
-    """How many samples have loops that objects of their class have, and one component."""
+    """How many samples have loops that objects of their class have, one component, faces through others."""
     expected = defaultdict(set)
     for record in records:
         expected[record.kind].add(record.loops)
@@ -149,6 +170,7 @@ def _topology(samples: Samples, records: list[Record]) -> dict:
     return {
         "loops_as_class": float(np.mean(right)),
         "one_component": float(np.mean(np.array(samples.components) == 1)),
+        "self_intersecting": float(np.mean(np.array(samples.piercing) > 0)),
     }
 
 

@@ -7,36 +7,75 @@ accuracy of a nearest neighbour as classifier.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+Points = np.ndarray | Sequence[np.ndarray]
+
 #: Cells per side in which points are counted.
 _JSD_CELLS = 28
 
 
-def chamfer_distances(a: np.ndarray, b: np.ndarray, told: Callable[[], None] = lambda: None) -> np.ndarray:
+def chamfer_distances(
+    a: Points, b: Points | None = None, told: Callable[[], None] = lambda: None
+) -> np.ndarray:
     """(len(a), len(b)) mean distances to the nearest point, there and back, halved.
 
     Args:
-        a: (n, p, 3).
-        b: (m, q, 3).
+        a: (n, p, 3), or n sets of points, (p, 3) each.
+        b: (m, q, 3); the same as ``a`` by default, at half the cost.
         told: called after each row.
 
     >>> points = np.zeros((1, 4, 3))
     >>> chamfer_distances(points, points + [0, 3, 4])
     array([[5.]])
     """
-    trees = [cKDTree(points) for points in b]
-    found = np.empty((len(a), len(b)))
-    for row, points in zip(found, a, strict=True):
-        tree = cKDTree(points)
-        row[:] = [(other.query(points)[0].mean() + tree.query(other.data)[0].mean()) / 2 for other in trees]
+    trees = [cKDTree(points) for points in a]
+    others = trees if b is None else [cKDTree(points) for points in b]
+    found = np.zeros((len(trees), len(others)))
+    for i, tree in enumerate(trees):
+        for j in range(i + 1 if b is None else 0, len(others)):
+            found[i, j] = _chamfer(tree, others[j])
+        told()
+    return found + found.T if b is None else found
+
+
+def nearest_chamfer_distances(
+    a: np.ndarray, b: np.ndarray, tried: int = 32, told: Callable[[], None] = lambda: None
+) -> np.ndarray:
+    """(len(a),) chamfer distances of each shape to the nearest of many.
+
+    Some 64 points of each choose the ``tried`` likeliest ones; among them all points decide.
+
+    Args:
+        a: (n, p, 3).
+        b: (m, q, 3).
+        tried: of ``b``, for each of ``a``.
+        told: called after each row.
+
+    >>> points = np.zeros((1, 8, 3))
+    >>> nearest_chamfer_distances(points, np.concatenate([points + 2, points + [0, 3, 4]]))
+    array([3.46410162])
+    """
+    rough = [cKDTree(points) for points in b[:, :: max(len(b[0]) // 64, 1)]]
+    trees: dict[int, cKDTree] = {}
+    found = np.empty(len(a))
+    for i, points in enumerate(a):
+        coarse, tree = cKDTree(points[:: max(len(points) // 64, 1)]), cKDTree(points)
+        likely = np.argsort([_chamfer(coarse, other) for other in rough], kind="stable")[:tried]
+        for j in likely:
+            trees.setdefault(j, cKDTree(b[j]))
+        found[i] = min(_chamfer(tree, trees[j]) for j in likely)
         told()
     return found
+
+
+def _chamfer(a: cKDTree, b: cKDTree) -> float:
+    return (a.query(b.data)[0].mean() + b.query(a.data)[0].mean()) / 2
 
 
 def earth_movers_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:

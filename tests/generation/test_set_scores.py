@@ -9,6 +9,7 @@ from gshell_mi.generation.set_scores import (
     earth_movers_distances,
     jensen_shannon_divergence,
     minimum_matching_distance,
+    nearest_chamfer_distances,
     nearest_neighbour_accuracy,
 )
 
@@ -65,3 +66,17 @@ def test_only_the_earth_mover_counts_how_many_points_there_are():
     b[0, 5:] = 1
     assert chamfer_distances(a, b)[0, 0] == 0
     assert earth_movers_distances(a, b)[0, 0] == pytest.approx(4 * np.sqrt(3) / 10)
+
+
+def test_distances_among_one_set_are_those_to_itself():
+    a = shapes(9, 3)
+    assert np.array_equal(chamfer_distances(a), chamfer_distances(a, a))
+
+
+def test_the_nearest_of_many_is_found_among_the_likeliest():
+    rng = np.random.default_rng(0)
+    true = rng.uniform(-0.5, 0.5, (60, 1, 3)) + rng.uniform(-0.3, 0.3, (60, 512, 3))
+    a = true[::6] + 0.01
+    expected = chamfer_distances(a, true)
+    assert np.array_equal(nearest_chamfer_distances(a, true, tried=8), expected.min(axis=1))
+    assert np.array_equal(expected.argmin(axis=1), np.arange(0, 60, 6))
