@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
+import os
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -126,6 +127,8 @@ def _run(jobs: list[tuple], processes: int, variant: str, advance: Callable[[int
         for job in jobs:
             _convert_shard(*job, advance=advance)
         return
+    # The processes are what runs side by side: threads of BLAS would wait for each other, for half the time.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Spawned, as a process that has used Dr.Jit must not be forked.
     with ProcessPoolExecutor(
         min(processes, len(jobs)),
