@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 def export_fit(
     output: Path,
-    fit: FitScene,
+    given: FitScene,
     material: MaterialField | GivenMaterial,
     light: EnvironmentLight | None,
     views: int,
@@ -46,7 +46,7 @@ def export_fit(
     """Writes meshes, light, scene and pictures of the views.
 
     Args:
-        fit: its subject is the result.
+        given: its subject is the result.
         light: None if it is the scene's own.
         views: how many training views, spread evenly, are rendered; of those held out, all are.
         texture: base colours at the vertices of the surface's mesh, divided ``texture_levels`` times; None
@@ -58,34 +58,34 @@ def export_fit(
     Returns:
         The metrics, which ``write_metrics`` stores.
     """
-    count = len(fit.sensors)
+    count = len(given.sensors)
     chosen = np.unique(np.linspace(0, count - 1, min(views, count)).round().astype(int))
-    shown = {TRAINING: [fit.training[index] for index in chosen], HELD_OUT: fit.held_out}
+    shown = {TRAINING: [given.training[index] for index in chosen], HELD_OUT: given.held_out}
     names = [[view.sensor.id() for view in group] for group in shown.values()]
     OwnFolder(output, "fit").claim("mesh.ply", "template.ply", "light.exr", "scene.xml", *view_files(*names))
-    surface = fit.subject.surface
+    surface = given.subject.surface
     vertices, faces = _write_surface(
         output / "mesh.ply", surface, attributes_of(material, surface), texture, texture_levels
     )
-    template = fit.subject.template()
+    template = given.subject.template()
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
-    write_light(output / "light.exr", fit.light, light)
-    write_scene(output / "scene.xml", fit.light, fit.sensors)
+    write_light(output / "light.exr", given.light, light)
+    write_scene(output / "scene.xml", given.light, given.sensors)
     scores = {}
     for folder, group in shown.items():
         if group:
             # The first training view has the light as it is stored.
-            turns = turns_with_camera([fit.sensors[0], *(view.sensor for view in group)])[1:]
+            turns = turns_with_camera([given.sensors[0], *(view.sensor for view in group)])[1:]
             lights = [light.turned(turn) for turn in turns] if light and light_turns else []
             exposed = gains[chosen] if folder == TRAINING and gains is not None else ()
             scores[folder] = write_views(output, folder, group, lights, exposed)
     return {
-        "scene": fit.path.name,
-        "targets": str(fit.targets[0].path.parent.absolute()),
+        "scene": given.path.name,
+        "targets": str(given.targets[0].path.parent.absolute()),
         "psnr_training": scores[TRAINING]["mean"]["psnr"],
         "training": scores[TRAINING],
-        **({"held_out": scores[HELD_OUT]} if fit.held_out else {}),
-        **({} if gains is None else {"exposures": _exposures(fit, gains)}),
+        **({"held_out": scores[HELD_OUT]} if given.held_out else {}),
+        **({} if gains is None else {"exposures": _exposures(given, gains)}),
         "counts": dataclasses.asdict(topology(vertices, faces)),
         "versions": {
             "gshell_mi": __version__,
@@ -106,10 +106,10 @@ def write_metrics(output: Path, metrics: dict, seconds: dict[str, float]) -> dic
     return metrics
 
 
-def _exposures(fit: FitScene, gains: np.ndarray) -> dict[str, Any]:
+def _exposures(given: FitScene, gains: np.ndarray) -> dict[str, Any]:
     """How (N, 3) gains expose the views: the mean of their channels in stops, what these differ by from it,
     and their spread."""
-    names, channels = [sensor.id() for sensor in fit.sensors], np.log2(gains)
+    names, channels = [sensor.id() for sensor in given.sensors], np.log2(gains)
     stops = channels.mean(axis=1)
     return {
         "spread_stops": round(float(stops.std()), 4),

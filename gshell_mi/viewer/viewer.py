@@ -101,12 +101,12 @@ class Viewer:
 
     # --- Observer
 
-    def begin(self, fit: FitScene) -> None:
+    def begin(self, given: FitScene) -> None:
         """Shows the cameras with their targets."""
         import viser.transforms
 
-        views = PinholeViews.from_sensors(fit.sensors)
-        box = np.array(fit.subject.to_world.matrix)
+        views = PinholeViews.from_sensors(given.sensors)
+        box = np.array(given.subject.to_world.matrix)
         centre = box[:3, 3]
         up = -views.bases[:, :, 1].mean(0)
         up /= np.linalg.norm(up)
@@ -127,7 +127,7 @@ class Viewer:
                 fov=2 * np.arctan(np.linalg.norm(down) / 2),
                 aspect=float(np.linalg.norm(across) / np.linalg.norm(down)),
                 scale=_FRUSTUM * float(np.linalg.norm(origin - centre)),
-                image=_thumbnail(fit.targets[index].rgba) if index in pictured else None,
+                image=_thumbnail(given.targets[index].rgba) if index in pictured else None,
                 thickness=1.5,
                 thickness_units="screen",
                 visible=False,

@@ -1,4 +1,4 @@
-"""The regression net: whole fits with default settings against stored results. `make regress` runs it.
+"""The regression net: whole fits against stored results. `make regress` runs it.
 
 It takes minutes per case, so `make test` does not collect it, but for the smallest case (test_small_fit.py).
 """

@@ -197,7 +197,7 @@ def test_small_scene_has_fewer_and_smaller_views_of_the_same_truth(tmp_path):
         cases.SCENES / "leaf" / "truth.ply"
     ).read_bytes()
     trial = SMALL.prepare(tmp_path / "again")
-    assert trial.config == FitConfig() and trial.scene.stem == SMALL.name
+    assert trial.config == FitConfig.for_effort("preview") and trial.scene.stem == SMALL.name
 
 
 def test_captures_are_made_once_and_scored_by_their_truth(tmp_path, monkeypatch):

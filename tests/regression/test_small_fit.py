@@ -1,4 +1,4 @@
-"""A whole fit with default settings, of few and small views, against a stored result."""
+"""A whole fit of the least effort, of few and small views, against a stored result."""
 
 import pytest
 from cases import SMALL

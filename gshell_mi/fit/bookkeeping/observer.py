@@ -32,7 +32,7 @@ class Preview:
 class Observer(Protocol):
     """What ``fit_scene`` tells of its progress; called on its thread, so it waits for the observer."""
 
-    def begin(self, fit: FitScene) -> None:
+    def begin(self, given: FitScene) -> None:
         """Before the first stage."""
 
     def step(

@@ -48,7 +48,7 @@ class JointStage:
     wait: while they do, a light that is mirrored is sought as if it fell on plaster.
 
     Args:
-        fit: the scene with its targets.
+        given: the scene with its targets.
         material: a ``GivenMaterial`` stays as it is.
         light: None keeps the scene's.
         config: what all stages know.
@@ -58,7 +58,7 @@ class JointStage:
 
     def __init__(
         self,
-        fit: FitScene,
+        given: FitScene,
         material: MaterialField | GivenMaterial,
         light: EnvironmentLight | None,
         config: FitConfig,
@@ -66,25 +66,25 @@ class JointStage:
         stage: JointConfig | None = None,
         iterations: int | None = None,
     ):
-        self.fit, self.material, self.light, self.config = fit, material, light, config
+        self.given, self.material, self.light, self.config = given, material, light, config
         self.stage = stage or config.joint
         self.iterations = config.iterations if iterations is None else iterations
-        self.subject = fit.subject
+        self.subject = given.subject
         self.subject.set_bsdf(mi.load_dict(principled()))
         for name, field in material.values().items():
             self.subject.attach_attribute(name, field)
-        self.scene = optimised_scene(fit, light)
+        self.scene = optimised_scene(given, light)
         self.parameters = mi.traverse(self.scene)
         #: Per view, how the light has turned; none if it stays.
-        self._turns = turns_with_camera(fit.sensors) if light and config.light_frame == "camera" else []
+        self._turns = turns_with_camera(given.sensors) if light and config.light_frame == "camera" else []
         #: Per view the share of each pixel that is known, None if that is all. The rest is black in images.
-        known = [np.asarray(target.known)[..., None] for target in fit.targets]
+        known = [np.asarray(target.known)[..., None] for target in given.targets]
         self._known = [None if share.all() else mi.TensorXf(share) for share in known]
         self._targets = [
             mi.TensorXf(target.rgba if share.all() else target.rgba * share)
-            for target, share in zip(fit.targets, known, strict=True)
+            for target, share in zip(given.targets, known, strict=True)
         ]
-        self._sees_masks = all(target.has_alpha for target in fit.targets) and not config.geometry_only
+        self._sees_masks = all(target.has_alpha for target in given.targets) and not config.geometry_only
         if config.geometry_only:
             self.subject.shade_flat()
         self.integrator = mi.load_dict(
@@ -116,7 +116,7 @@ class JointStage:
             lr=stage.light_lr, epsilon=1e-12, params={"log_radiance": light.log_radiance} if light else None
         )
         sought = material if material.parameters else None
-        self._regularisers = Regularisers(StepView(fit, self.scene, sought, light), config.losses)
+        self._regularisers = Regularisers(StepView(given, self.scene, sought, light), config.losses)
 
     @property
     def optimizers(self) -> dict[str, mi.ad.Adam]:
@@ -219,7 +219,7 @@ class JointStage:
 
     def _views(self, iteration: int) -> list[int]:
         """Those of a step: every view once per round, in an order that depends on seed and round alone."""
-        count, views = len(self.fit.sensors), []
+        count, views = len(self.given.sensors), []
         for turn in range(iteration * self.config.render.views, (iteration + 1) * self.config.render.views):
             order = np.random.default_rng((self.config.seed, turn // count)).permutation(count)
             views.append(int(order[turn % count]))
@@ -234,7 +234,7 @@ class JointStage:
             image = mi.render(
                 self.scene,
                 self.parameters,
-                sensor=self.fit.sensors[view],
+                sensor=self.given.sensors[view],
                 integrator=self.integrator,
                 spp=config.primal_spp,
                 spp_grad=config.spp,
@@ -310,18 +310,18 @@ class JointStage:
         optimizer.step()
 
 
-def optimised_scene(fit: FitScene, light: EnvironmentLight | None) -> mi.Scene:
+def optimised_scene(given: FitScene, light: EnvironmentLight | None) -> mi.Scene:
     """The fit scene with the light to optimise in place of its own, and without its sensors."""
-    return mi.load_dict({"type": "scene", "subject": fit.subject, **other_objects(fit, light)})
+    return mi.load_dict({"type": "scene", "subject": given.subject, **other_objects(given, light)})
 
 
-def other_objects(fit: FitScene, light: EnvironmentLight | None) -> dict:
+def other_objects(given: FitScene, light: EnvironmentLight | None) -> dict:
     """All of the fit scene but its gshell shape and its sensors, with the light to optimise."""
-    objects = {"light": light.emitter() if light else fit.light}
-    for index, shape in enumerate(fit.scene.shapes()):
-        if shape is not fit.subject:
+    objects = {"light": light.emitter() if light else given.light}
+    for index, shape in enumerate(given.scene.shapes()):
+        if shape is not given.subject:
             objects[f"shape_{index}"] = shape
-    for index, emitter in enumerate(fit.scene.emitters()):
+    for index, emitter in enumerate(given.scene.emitters()):
         if emitter.id() != "light" and not emitter.is_environment() and not emitter.shape():
             objects[f"emitter_{index}"] = emitter
     return objects

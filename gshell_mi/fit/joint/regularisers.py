@@ -80,7 +80,7 @@ class StepView:
     """What a step of the joint stage is about: what losses are functions of.
 
     Args:
-        fit: its subject holds the attached fields and mesh of the present step.
+        given: its subject holds the attached fields and mesh of the present step.
         scene: the scene that is rendered.
         material: what is optimised; None if it is given.
         light: the same.
@@ -91,14 +91,14 @@ class StepView:
 
     def __init__(
         self,
-        fit: FitScene,
+        given: FitScene,
         scene: mi.Scene,
         material: MaterialField | GivenMaterial | None,
         light: EnvironmentLight | None,
     ):
-        self.fit, self.scene, self.material, self.light = fit, scene, material, light
-        self.subject, self.view = fit.subject, 0
-        self.depths = any(target.depth is not None for target in fit.targets)
+        self.given, self.scene, self.material, self.light = given, scene, material, light
+        self.subject, self.view = given.subject, 0
+        self.depths = any(target.depth is not None for target in given.targets)
         self.cubes = self.subject.lattice.weight_count
 
     def look_from(self, view: int) -> None:
@@ -117,7 +117,7 @@ class StepView:
     @cached_property
     def views(self) -> PinholeViews:
         """The cameras."""
-        return PinholeViews.from_sensors(self.fit.sensors)
+        return PinholeViews.from_sensors(self.given.sensors)
 
     @cached_property
     def template(self) -> SurfaceMesh:
@@ -138,12 +138,12 @@ class StepView:
     @property
     def alpha(self) -> mi.Float:
         """Coverage of the view's pixels."""
-        return mi.Float(self.fit.targets[self.view].rgba[..., 3].ravel())
+        return mi.Float(self.given.targets[self.view].rgba[..., 3].ravel())
 
     @property
     def color(self) -> mi.Color3f:
         """The view's target."""
-        return mi.Color3f(np.ascontiguousarray(self.fit.targets[self.view].rgba[..., :3].reshape(-1, 3).T))
+        return mi.Color3f(np.ascontiguousarray(self.given.targets[self.view].rgba[..., :3].reshape(-1, 3).T))
 
     def is_visible(self, points: mi.Point3f) -> mi.Bool:
         """Whether the view frames points and nothing is before them."""
@@ -188,7 +188,7 @@ class Regularisers:
 @register_loss("depth", per_view=True, needs="depths")
 def _depth(step: StepView) -> mi.Float:
     """Difference to the view's depth map."""
-    target = step.fit.targets[step.view]
+    target = step.given.targets[step.view]
     if target.depth is None:
         return mi.Float(0)
     known = mi.Float(target.depth.ravel())
