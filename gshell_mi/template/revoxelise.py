@@ -8,6 +8,7 @@ surface. So the open side is moved away until the lattice can tell both apart.
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
@@ -55,6 +56,19 @@ _RIM = 2.0
 _FRACTIONS = (1.0, 0.7, 0.4)
 
 
+@dataclass(frozen=True)
+class Revoxelised:
+    """Fields of a template that has moved.
+
+    Attributes:
+        fields: ``sdf``, ``msdf``, ``radiance`` (n, 3) and ``known`` (n,) on the lattice.
+        has_loops: whether their surface has as many boundary loops as were asked for.
+    """
+
+    fields: dict[str, np.ndarray]
+    has_loops: bool
+
+
 def revoxelise(
     subject: mi.Shape,
     lattice: Lattice,
@@ -66,8 +80,10 @@ def revoxelise(
     min_area: float,
     wanted: Topology,
     fewest_loops: int | None = None,
-) -> dict[str, np.ndarray] | None:
+) -> Revoxelised | None:
     """Fields whose surface is the moved template's, with its openings.
+
+    Parts of the movement are tried until one leaves all boundary loops.
 
     Args:
         subject: the gshell shape, whose place the fields are in.
@@ -82,11 +98,10 @@ def revoxelise(
         fewest_loops: so few boundary loops will do; by default as many as are wanted.
 
     Returns:
-        ``sdf``, ``msdf``, ``radiance`` (n, 3) and ``known`` (n,) on the lattice; None if the surface
-        comes out torn, with fewer boundary loops, more components or many more pin-holes, however little it
-        moves.
+        The fields, of the whole movement if no part of it leaves all boundary loops; None if the surface
+        comes out torn, with more components or many more pin-holes, however little it moves.
     """
-    nearly = None
+    nearly, closed_up = None, None
     fewest_loops = wanted.boundary_loops if fewest_loops is None else fewest_loops
     for fraction in _FRACTIONS:
         placed = vertices + fraction * (moved - vertices)
@@ -103,12 +118,15 @@ def revoxelise(
             *positive_part(placed, faces, logits),
             _RIM * lattice.spacing * subject.length_scale,
         )
-        if found.boundary_loops >= fewest_loops and found.components <= wanted.components and not torn:
-            if found.pinholes <= wanted.pinholes:
-                return fields
-            if nearly is None and found.pinholes <= wanted.pinholes + _PINHOLES:
-                nearly = fields
-    return nearly
+        if torn or found.components > wanted.components or found.pinholes > wanted.pinholes + _PINHOLES:
+            continue
+        if found.boundary_loops < fewest_loops:
+            closed_up = closed_up or Revoxelised(fields, has_loops=False)
+        elif found.pinholes <= wanted.pinholes:
+            return Revoxelised(fields, has_loops=True)
+        else:
+            nearly = nearly or Revoxelised(fields, has_loops=True)
+    return nearly or closed_up
 
 
 def _fields(

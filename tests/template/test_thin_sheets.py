@@ -61,7 +61,7 @@ def test_of_a_sheet_one_side_is_left(thickness):
     assert found.topology.boundary_loops == 1
 
     subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
-    fields = revoxelise(
+    made = revoxelise(
         subject,
         subject.lattice,
         vertices,
@@ -73,8 +73,9 @@ def test_of_a_sheet_one_side_is_left(thickness):
         found.topology,
         found.fewest_loops,
     )
-    closed = LatticeFields.closed(fields["sdf"])
-    subject.set_fields(LatticeFields(closed.sdf, fields["msdf"], closed.deform))
+    assert made is not None and made.has_loops
+    closed = LatticeFields.closed(made.fields["sdf"])
+    subject.set_fields(LatticeFields(closed.sdf, made.fields["msdf"], closed.deform))
     surface, surface_faces, _ = subject.surface.to_numpy()
     after = topology(surface, surface_faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)

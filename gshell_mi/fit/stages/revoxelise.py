@@ -5,7 +5,7 @@ Sides of thin sheets that a template can do without are left out on the way.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import mitsuba as mi
@@ -25,7 +25,8 @@ from ..unseen import without_unseen_parts
 
 
 class Revoxelise:
-    """Takes the best of what stages have moved the template to that comes out whole."""
+    """Takes the best of what stages have moved the template to that comes out whole, with its boundary loops
+    or better without one of them."""
 
     name = "revoxelise"
 
@@ -37,24 +38,46 @@ class Revoxelise:
             template = template_of(fit.scene.subject, surface)
             radiance = template.mesh.interpolate(mi.Float(surface.seen.radiance.ravel()), 3).numpy().T
             still = Moved("start", template.start, radiance)
-            found, taken = _whole(fit, template, (*surface.moved, still), surface)
+            found, taken = _taken(fit, template, (*surface.moved, still), surface, steps)
             steps.fact("refinement_kept", taken not in ("start", ""))
             if taken == "folds":
                 steps.fact("folds_kept", True)
-            return without_unseen_parts(fit, found or replace(surface, hull=None, moved=()))
+            return without_unseen_parts(fit, replace(found, hull=None, moved=()))
 
 
-def _whole(
+def _taken(
+    fit: Fit, template: Template, moved: Iterable[Moved], surface: Surface, steps: Steps
+) -> tuple[Surface, str]:
+    """The first movement, of the best first, of which fields with all boundary loops can be made, cut as well
+    as can be, and its stage; the surface as it is and an empty name if there is none.
+
+    Of a better one the lattice may have closed a loop, a slit of less than a cell: then unseen views decide.
+    """
+    whole, closed_up = (surface, ""), None
+    for found, stage, has_loops in _made(fit, template, moved, surface):
+        if has_loops:
+            whole = found, stage
+            break
+        closed_up = closed_up or (found, stage)
+    if closed_up is None:
+        return whole
+    meshes = [fit.scene.subject.surface_of(found.fields).to_numpy()[:2] for found, _ in (whole, closed_up)]
+    verdict = fit.judge.decide(*meshes)
+    steps.fact("closed_loops_verdict", verdict.facts())
+    return closed_up if verdict.accepted[0] else whole
+
+
+def _made(
     fit: Fit, template: Template, moved: Iterable[Moved], surface: Surface
-) -> tuple[Surface | None, str]:
-    """The first movement, of the best first, of which fields can be made, cut as well as can be, and its
-    stage; None and an empty name if none comes out whole."""
+) -> Iterator[tuple[Surface, str, bool]]:
+    """The surfaces that come out whole, the best first: with the stage that moved them, and whether they have
+    all boundary loops."""
     subject, lattice, min_area = fit.scene.subject, surface.lattice, fit.config.topology.min_area
     for candidate in moved:
         if (candidate.positions == template.vertices).all():
             continue
         for cut in _cuts(fit, template, candidate.positions, fit.cell(surface)):
-            fields = revoxelise(
+            made = revoxelise(
                 subject,
                 lattice,
                 template.vertices,
@@ -66,11 +89,12 @@ def _whole(
                 cut.topology,
                 cut.fewest_loops,
             )
-            if fields:
+            if made:
+                fields = made.fields
                 closed = LatticeFields.closed(fields["sdf"], lattice.grid)
                 seen = Seen(fields["radiance"], fields["known"], surface.seen.light)
-                return Surface(replace(closed, msdf=fields["msdf"]), seen=seen), candidate.stage
-    return None, ""
+                found = Surface(replace(closed, msdf=fields["msdf"]), seen=seen)
+                yield found, candidate.stage, made.has_loops
 
 
 def _cuts(fit: Fit, template: Template, moved: np.ndarray, cell: float) -> list[Cut]:

@@ -1,0 +1,61 @@
+"""Which of the movements is taken where the lattice closes a loop of the best."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gshell_mi.fit.judge import Verdict
+from gshell_mi.fit.stages import revoxelise
+
+
+class Steps:
+    def __init__(self):
+        self.facts = {}
+
+    def fact(self, name, value):
+        self.facts[name] = value
+
+
+def fit(gain: float) -> SimpleNamespace:
+    """A fit whose judge finds that gain, with a noise of 1."""
+
+    def decide(before, after):
+        assert (before, after) == (("start", "faces"), ("refined", "faces"))
+        return Verdict(*(np.array([value]) for value in (1.0, 1.0, gain, 1.0)))
+
+    mesh = SimpleNamespace(surface_of=lambda name: SimpleNamespace(to_numpy=lambda: (name, "faces", None)))
+    return SimpleNamespace(judge=SimpleNamespace(decide=decide), scene=SimpleNamespace(subject=mesh))
+
+
+def surface(name: str) -> SimpleNamespace:
+    return SimpleNamespace(fields=name)
+
+
+@pytest.mark.parametrize(
+    ("made", "gain", "stage", "judged"),
+    [
+        ([("folded", "folds", True), ("refined", "refinement", True)], 9, "folds", False),
+        ([("refined", "refinement", False), ("start", "start", True)], 9, "refinement", True),
+        ([("refined", "refinement", False), ("start", "start", True)], 1, "start", True),
+        # The best of what has closed a loop is asked for, against the best that has not.
+        (
+            [("refined", "folds", False), ("worse", "refinement", False), ("start", "start", True)],
+            9,
+            "folds",
+            True,
+        ),
+    ],
+)
+def test_views_decide_on_what_has_closed_a_loop(made, gain, stage, judged, monkeypatch):
+    found = ((surface(name), by, has_loops) for name, by, has_loops in made)
+    monkeypatch.setattr(revoxelise, "_made", lambda *given: found)
+    steps = Steps()
+    assert revoxelise._taken(fit(gain), None, (), surface("whole"), steps)[1] == stage
+    assert ("closed_loops_verdict" in steps.facts) == judged
+
+
+def test_what_nothing_comes_of_stays_as_it_is(monkeypatch):
+    monkeypatch.setattr(revoxelise, "_made", lambda *given: iter(()))
+    kept, stage = revoxelise._taken(fit(9), None, (), surface("whole"), Steps())
+    assert (kept.fields, stage) == ("whole", "")
