@@ -23,6 +23,7 @@ from gshell_mi.generation.fields import TRUNCATION_CELLS
 from gshell_mi.generation.model_config import ModelConfig
 from gshell_mi.generation.models import Steering, make_model
 from gshell_mi.generation.models.autoencoder import seen
+from gshell_mi.generation.models.shape_flow import leading_eigenvectors
 from gshell_mi.generation.models.training_set import TrainingSet
 from gshell_mi.train.__main__ import main
 
@@ -55,7 +56,8 @@ def test_a_seed_is_one_model_and_a_run_in_two_parts_the_same(tiny_set, tmp_path)
     train_tiny(tiny_set, tmp_path / "whole", 6)
     # The rate depends on the length of the whole, so the first part is that of a run cut off.
     script = (
-        "import sys, pathlib\n"
+        "import sys, pathlib, torch\n"
+        "torch.set_num_threads(1)\n"  # as here: sums of other threads are rounded otherwise
         "from gshell_mi.generation import training\n"
         "step = training._Training._take_step\n"
         "def cut(self, *given):\n"
@@ -264,3 +266,13 @@ def test_a_killed_training_goes_on(tiny_set, tmp_path):
     before = len(losses(tmp_path / "m"))
     saved = load_file(tmp_path / "m" / "checkpoint.safetensors")
     assert before > 0 and any(name.startswith("adam.exp_avg.") for name in saved)
+
+
+def test_leading_eigenvectors_of_a_large_matrix_are_those_of_all():
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(200, 60)) * np.geomspace(1, 0.05, 60)
+    matrix = rows @ rows.T
+    found = leading_eigenvectors(matrix, 12)
+    every = np.linalg.eigh(matrix)[1][:, ::-1][:, :12]
+    assert np.allclose(np.abs((found * every).sum(axis=0)), 1, atol=1e-9)
+    assert np.array_equal(found, leading_eigenvectors(matrix, 12))

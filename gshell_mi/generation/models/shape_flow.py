@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from scipy import ndimage
+from scipy.sparse.linalg import eigsh
 from torch import Tensor, nn
 
 from ..fields import TRUNCATION_CELLS
@@ -104,9 +105,10 @@ class ShapeFlow(nn.Module):
 
     def _find_components(self, centred: Tensor) -> None:
         # Of few objects by their products, n x n, not by those of tens of thousands of nodes.
-        _, vectors = torch.linalg.eigh((centred @ centred.T).double())
         kept = min(self.components, len(centred) - 1)
-        found = vectors.flip(1)[:, :kept].T.float() @ centred  # (kept, values), not normalised
+        vectors = leading_eigenvectors((centred @ centred.T).double().cpu().numpy(), kept)
+        leading = torch.from_numpy(np.ascontiguousarray(vectors.T)).to(centred)
+        found = leading @ centred  # (kept, values), not normalised
         found = found / found.norm(dim=1, keepdim=True)
         deviation = (centred @ found.T).square().mean(dim=0).sqrt()
         found = found * deviation[:, None]
@@ -250,3 +252,19 @@ class ShapeFlow(nn.Module):
         for _ in range(3):  # each turn the last axis becomes the first of the three
             values = (values @ matrix.T).permute(0, 1, 4, 2, 3)
         return values.contiguous()
+
+
+def leading_eigenvectors(matrix: np.ndarray, count: int) -> np.ndarray:
+    """(n, count): unit eigenvectors of a symmetric (n, n) matrix without negative eigenvalues, those of the
+    largest first. The same matrix has the same ones.
+
+    >>> leading_eigenvectors(np.diag([1.0, 3.0, 2.0]), 2).round(6).__abs__()
+    array([[0., 0.],
+           [1., 0.],
+           [0., 1.]])
+    """
+    if 4 * count > len(matrix):
+        # Lanczos' method would find all there is, and go on from random vectors.
+        return np.linalg.eigh(matrix)[1][:, ::-1][:, :count]
+    begin = np.random.default_rng(0).normal(size=len(matrix))
+    return eigsh(matrix, count, v0=begin)[1][:, ::-1]
