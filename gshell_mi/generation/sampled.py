@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import numpy as np
 import trimesh
 
+from ..bars import Bars
 from ..errors import UserError
 from ..evaluation.mesh_scores import read_mesh
 from ..files import replacing
@@ -99,6 +101,7 @@ def generate(
             seconds,
             suffix,
             film=interpolate is not None,
+            quiet=quiet,
         )
 
 
@@ -143,10 +146,8 @@ def _write(
     suffix: str,
     *,
     film: bool,
+    quiet: bool,
 ) -> str:
-    from ..export.gltf import Part, write_glb
-    from ..export.ply import write_ply
-
     names = [f"meshes/{index:04d}.{suffix}" for index in range(len(fields))]
     written = ["fields.npz", "samples.json", "sheet.png", *(["interpolation.mp4"] if film else []), *names]
     folder.check_free(written)
@@ -154,43 +155,30 @@ def _write(
     folder.claim(*written)
     (folder.path / "meshes").mkdir(exist_ok=True)
     pictures, labels, told = [], [], []
-    for index, (pair, kind, name) in enumerate(zip(fields, kinds, names, strict=True)):
-        mesh = TruncatedFields(*pair).surface(largest=True)
-        found = topology(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-        told.append(
-            {
-                "file": name,
-                "class": kind,
-                "seeds": seeds[index],
-                "loops": found.boundary_loops,
-                "components": found.components,
-                "faces": found.faces,
-            }
-        )
-        labels.append(f"{kind}, {counted(found.boundary_loops, 'loop')}")
-        if len(mesh.faces) == 0:
-            pictures.append(np.full((128, 128, 3), 255, np.uint8))
-            continue
-        pictures.append(picture(mesh))
-        placed = trimesh.Trimesh(mesh.vertices @ back[:3, :3].T + back[:3, 3], mesh.faces, process=False)
-        normals = unit(np.asarray(placed.vertex_normals))
-        if suffix == "ply":
-            write_ply(folder.path / name, placed.vertices, placed.faces, normals, {})
-        else:
-            write_glb(
-                folder.path / name,
-                [
-                    Part(
-                        "sample",
-                        placed.faces,
-                        {
-                            "POSITION": np.asarray(placed.vertices, np.float32),
-                            "NORMAL": normals.astype(np.float32),
-                        },
-                        {"doubleSided": True},
-                    )
-                ],
+    with Bars(quiet=quiet) as progress:
+        bar = progress.add_task("meshes", total=len(fields))
+        for index, (pair, kind, name) in enumerate(zip(fields, kinds, names, strict=True)):
+            began = time.perf_counter()
+            mesh = TruncatedFields(*pair).surface(largest=True)
+            seconds += time.perf_counter() - began
+            found = topology(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+            told.append(
+                {
+                    "file": name,
+                    "class": kind,
+                    "seeds": seeds[index],
+                    "loops": found.boundary_loops,
+                    "components": found.components,
+                    "faces": found.faces,
+                }
             )
+            labels.append(f"{kind}, {counted(found.boundary_loops, 'loop')}")
+            if len(mesh.faces):
+                pictures.append(picture(mesh))
+                _write_mesh(folder.path / name, mesh, back)
+            else:
+                pictures.append(np.full((128, 128, 3), 255, np.uint8))
+            progress.advance(bar)
     with replacing(folder.path / "fields.npz") as partial:
         np.savez_compressed(partial, fields=fields.astype(np.float16))
     with replacing(folder.path / "samples.json") as partial:
@@ -210,3 +198,17 @@ def _write(
         f"{folder.path}: {counted(len(fields), 'sample')} in {seconds:.1f} s "
         f"({seconds / len(fields):.2f} s each); see sheet.png"
     )
+
+
+def _write_mesh(path: Path, mesh: trimesh.Trimesh, back: np.ndarray) -> None:
+    """Writes a mesh in its place in the world, as PLY or GLB."""
+    from ..export.gltf import Part, write_glb
+    from ..export.ply import write_ply
+
+    placed = trimesh.Trimesh(mesh.vertices @ back[:3, :3].T + back[:3, 3], mesh.faces, process=False)
+    normals = unit(np.asarray(placed.vertex_normals))
+    if path.suffix == ".ply":
+        write_ply(path, placed.vertices, placed.faces, normals, {})
+        return
+    given = {"POSITION": np.asarray(placed.vertices, np.float32), "NORMAL": normals.astype(np.float32)}
+    write_glb(path, [Part("sample", placed.faces, given, {"doubleSided": True})])
