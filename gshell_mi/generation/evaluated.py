@@ -142,7 +142,9 @@ def evaluate(
     ]
     true_rims = [rim for rim in true_rims if len(rim)]
     if rims and true_rims:
-        scores["mmd_boundary"] = minimum_matching_distance(chamfer_distances(rims, true_rims))
+        scores["mmd_boundary"] = minimum_matching_distance(
+            chamfer_distances(np.array(rims), np.array(true_rims))
+        )
     if emd:
         a, b = a[:emd, :128], b[:emd, :128]
         moved = earth_movers_distances(a, b)

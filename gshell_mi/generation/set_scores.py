@@ -7,26 +7,26 @@ accuracy of a nearest neighbour as classifier.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
+import drjit as dr
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-Points = np.ndarray | Sequence[np.ndarray]
+from ..arrays import Array3f, Float, UInt32
 
 #: Cells per side in which points are counted.
 _JSD_CELLS = 28
 
 
 def chamfer_distances(
-    a: Points, b: Points | None = None, told: Callable[[], None] = lambda: None
+    a: np.ndarray, b: np.ndarray | None = None, told: Callable[[], None] = lambda: None
 ) -> np.ndarray:
-    """(len(a), len(b)) mean distances to the nearest point, there and back, halved.
+    """(len(a), len(b)) mean distances to the nearest point, there and back, halved. Needs a Mitsuba variant.
 
     Args:
-        a: (n, p, 3), or n sets of points, (p, 3) each.
+        a: (n, p, 3).
         b: (m, q, 3); the same as ``a`` by default, at half the cost.
         told: called after each row.
 
@@ -34,12 +34,11 @@ def chamfer_distances(
     >>> chamfer_distances(points, points + [0, 3, 4])
     array([[5.]])
     """
-    trees = [cKDTree(points) for points in a]
-    others = trees if b is None else [cKDTree(points) for points in b]
-    found = np.zeros((len(trees), len(others)))
-    for i, tree in enumerate(trees):
-        for j in range(i + 1 if b is None else 0, len(others)):
-            found[i, j] = _chamfer(tree, others[j])
+    others = a if b is None else b
+    found = np.zeros((len(a), len(others)))
+    for i, points in enumerate(a):
+        first = i + 1 if b is None else 0
+        found[i, first:] = _chamfer(points, others[first:])
         told()
     return found + found.T if b is None else found
 
@@ -47,7 +46,7 @@ def chamfer_distances(
 def nearest_chamfer_distances(
     a: np.ndarray, b: np.ndarray, tried: int = 32, told: Callable[[], None] = lambda: None
 ) -> np.ndarray:
-    """(len(a),) chamfer distances of each shape to the nearest of many.
+    """(len(a),) chamfer distances of each shape to the nearest of many. Needs a Mitsuba variant.
 
     Some 64 points of each choose the ``tried`` likeliest ones; among them all points decide.
 
@@ -58,24 +57,49 @@ def nearest_chamfer_distances(
         told: called after each row.
 
     >>> points = np.zeros((1, 8, 3))
-    >>> nearest_chamfer_distances(points, np.concatenate([points + 2, points + [0, 3, 4]]))
-    array([3.46410162])
+    >>> nearest_chamfer_distances(points, np.concatenate([points + 2, points + [0, 3, 4]])).round(3)
+    array([3.464])
     """
-    rough = [cKDTree(points) for points in b[:, :: max(len(b[0]) // 64, 1)]]
-    trees: dict[int, cKDTree] = {}
+    rough = b[:, :: max(b.shape[1] // 64, 1)]
     found = np.empty(len(a))
     for i, points in enumerate(a):
-        coarse, tree = cKDTree(points[:: max(len(points) // 64, 1)]), cKDTree(points)
-        likely = np.argsort([_chamfer(coarse, other) for other in rough], kind="stable")[:tried]
-        for j in likely:
-            trees.setdefault(j, cKDTree(b[j]))
-        found[i] = min(_chamfer(tree, trees[j]) for j in likely)
+        likely = np.argsort(_chamfer(points[:: max(len(points) // 64, 1)], rough), kind="stable")[:tried]
+        found[i] = _chamfer(points, b[likely]).min()
         told()
     return found
 
 
-def _chamfer(a: cKDTree, b: cKDTree) -> float:
-    return (a.query(b.data)[0].mean() + b.query(a.data)[0].mean()) / 2
+def _chamfer(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(m,) chamfer distances of one shape, (p, 3), to m others, (m, q, 3). All pairs of points are compared,
+    which is faster than a tree for some hundreds of points."""
+    import mitsuba as mi
+
+    many, each, count = len(others), others.shape[1], len(points)
+    if not many:
+        return np.zeros(0)
+    shape, all_others = (
+        mi.Point3f(np.ascontiguousarray(given.reshape(-1, 3).T, np.float32)) for given in (points, others)
+    )
+    there = _to_nearest(all_others, mi.UInt32(0), shape, count)
+    lane = dr.arange(mi.UInt32, many * count)
+    other = lane // dr.opaque(mi.UInt32, count)
+    query = dr.gather(mi.Point3f, shape, lane - other * dr.opaque(mi.UInt32, count))
+    back = _to_nearest(query, other * dr.opaque(mi.UInt32, each), all_others, each)
+    return (there.numpy().reshape(many, -1).mean(axis=1) + back.numpy().reshape(many, -1).mean(axis=1)) / 2
+
+
+def _to_nearest(query: Array3f, first: UInt32, cloud: Array3f, count: int) -> Float:
+    """Distance of each query to the nearest of ``count`` points of a cloud, from ``first`` on."""
+    import mitsuba as mi
+
+    stop = dr.opaque(mi.UInt32, count)
+
+    def body(index: UInt32, least: Float) -> tuple[UInt32, Float]:
+        offset = dr.gather(mi.Point3f, cloud, first + index) - query
+        return index + 1, dr.minimum(least, dr.squared_norm(offset))
+
+    begin = mi.UInt32(0), dr.full(mi.Float, dr.inf, dr.width(query))
+    return dr.sqrt(dr.while_loop(begin, lambda index, least: index < stop, body)[1])
 
 
 def earth_movers_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
