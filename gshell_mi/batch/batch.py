@@ -22,6 +22,9 @@ from .work import finished, run_job
 
 #: Jobs that Ray is given at once; the others wait here, so that millions do not fill its tables.
 _SUBMITTED = 2000
+#: Bytes for what is handed from job to job, which is next to nothing; by default Ray takes 30 % of the memory,
+#: and does not start where others use it.
+_OBJECT_STORE = 128 << 20
 
 
 def run_batch(
@@ -91,9 +94,19 @@ def _run_all(
     quiet: bool,
 ) -> None:
     try:
-        own = {} if address else {"num_cpus": cpus, "include_dashboard": False}
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
+        own = (
+            {}
+            if address
+            else {"num_cpus": cpus, "include_dashboard": False, "object_store_memory": _OBJECT_STORE}
+        )
+        # "local" starts one even where another runs, which would refuse these numbers.
+        ray.init(address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **own)
     except Exception as error:  # Ray raises whatever it stumbles over
+        if not address:
+            raise UserError(
+                f"Ray cannot start on this machine ({_first_line(error)}); give it more memory, or name a "
+                f"cluster with --address."
+            ) from error
         raise UserError(
             f"There is no Ray cluster at '{address}' ({type(error).__name__}); start one with "
             f"ray start --head, or leave --address out."
@@ -152,6 +165,10 @@ def _outcome(ray, reference, job: Job) -> dict:
         }
     except Exception as error:  # what the job's function raised, as where storage cannot be written
         return {"name": job.name, "status": "failed", "code": None, "seconds": 0.0, "told": str(error)}
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
 def _write(folder: OwnFolder, name: str, text: str) -> None:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -169,6 +170,21 @@ def test_without_ray_it_is_told(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
     assert main([str(write_jobs(tmp_path / "jobs", wrong("a"))), "-o", str(tmp_path / "out")]) == 2
     assert "This needs Ray; install it with pip install 'gshell_mi[ray]'" in capsys.readouterr().err
+
+
+def test_a_cluster_that_does_not_start_is_told(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("fsspec")
+
+    def init(address, **options):
+        raise ValueError("no memory is left\nand more")
+
+    ray = SimpleNamespace(init=init, shutdown=lambda: None)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    given = [str(write_jobs(tmp_path / "jobs", wrong("a"))), "-o", str(tmp_path / "out")]
+    assert main(given) == 2
+    assert "Ray cannot start on this machine (no memory is left); give it" in capsys.readouterr().err
+    assert main([*given, "--address", "ray://none"]) == 2
+    assert "There is no Ray cluster at 'ray://none' (ValueError)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
