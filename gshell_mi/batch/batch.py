@@ -22,8 +22,8 @@ from .work import finished, run_job
 
 #: Jobs that Ray is given at once; the others wait here, so that millions do not fill its tables.
 _SUBMITTED = 2000
-#: Bytes for what is handed from job to job, which is next to nothing; by default Ray takes 30 % of the memory,
-#: and does not start where others use it.
+#: Bytes for what is handed from job to job, which is next to nothing; by default Ray takes 30 % of the
+#: memory, and does not start where others use it.
 _OBJECT_STORE = 128 << 20
 
 
