@@ -94,13 +94,10 @@ def _run_all(
     quiet: bool,
 ) -> None:
     try:
-        own = (
-            {}
-            if address
-            else {"num_cpus": cpus, "include_dashboard": False, "object_store_memory": _OBJECT_STORE}
-        )
-        # "local" starts one even where another runs, which would refuse these numbers.
-        ray.init(address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **own)
+        # "local" starts one even where another runs, which would refuse its own numbers.
+        own = {"num_cpus": cpus, "include_dashboard": False, "object_store_memory": _OBJECT_STORE}
+        where = {"address": address} if address else {"address": "local", **own}
+        ray.init(log_to_driver=False, logging_level=logging.ERROR, **where)
     except Exception as error:  # Ray raises whatever it stumbles over
         if not address:
             raise UserError(

@@ -53,10 +53,11 @@ def test_one_shape_over_and_over_covers_one():
 
 
 def test_a_shift_is_the_distance_by_either_measure():
-    points = np.random.default_rng(0).uniform(-1, 1, (1, 100, 3))
-    moved = points + np.array([0.001, 0, 0])
-    assert chamfer_distances(points, moved)[0, 0] == pytest.approx(0.001, rel=1e-4)  # single precision
-    assert earth_movers_distances(points, moved)[0, 0] == pytest.approx(0.001)
+    # Of numbers that single precision holds exactly.
+    points = np.random.default_rng(0).integers(-4096, 4096, (1, 100, 3)) / 4096
+    moved = points + np.array([1 / 1024, 0, 0])
+    assert chamfer_distances(points, moved)[0, 0] == pytest.approx(1 / 1024)
+    assert earth_movers_distances(points, moved)[0, 0] == pytest.approx(1 / 1024)
 
 
 def test_only_the_earth_mover_counts_how_many_points_there_are():

@@ -45,6 +45,12 @@ def counts(loops: int) -> Topology:
     )
 
 
+def revoxelised(subject, vertices, moved, faces, logits, wanted: Topology) -> Revoxelised | None:
+    """Of a white template, on the subject's lattice."""
+    white = np.ones((len(vertices), 3))
+    return revoxelise(subject, subject.lattice, vertices, moved, faces, logits, white, 0.005, wanted)
+
+
 def solid(vertices) -> np.ndarray:
     return np.full(len(vertices), 8.0)
 
@@ -81,17 +87,7 @@ def test_a_sphere_that_grew(mirror):
 def test_the_opening_moves_along():
     subject, vertices, faces = sphere()
     logits = (0.2 - vertices[:, 1]) / CELL
-    made = revoxelise(
-        subject,
-        subject.lattice,
-        vertices,
-        vertices * [1, 1.25, 1],
-        faces,
-        logits,
-        np.ones((len(vertices), 3)),
-        0.005,
-        counts(1),
-    )
+    made = revoxelised(subject, vertices, vertices * [1, 1.25, 1], faces, logits, counts(1))
     found = surface(subject, made)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
@@ -109,17 +105,7 @@ def test_a_sheet_stays_whole_and_in_its_place():
     vertices[:, 2] += top - CELL / 6
     logits = np.where(vertices[:, 2] > top - 0.1 * CELL, 0.5 - np.hypot(*vertices[:, :2].T), -1) / CELL
     subject, *_ = sphere()
-    made = revoxelise(
-        subject,
-        subject.lattice,
-        vertices,
-        vertices,
-        faces,
-        logits,
-        np.ones((len(vertices), 3)),
-        0.005,
-        counts(1),
-    )
+    made = revoxelised(subject, vertices, vertices, faces, logits, counts(1))
     found = surface(subject, made)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (1, 0, 1)
@@ -131,17 +117,7 @@ def test_a_sheet_stays_whole_and_in_its_place():
 
 def test_a_collapse_goes_only_as_far_as_the_surface_lasts():
     subject, vertices, faces = sphere()
-    made = revoxelise(
-        subject,
-        subject.lattice,
-        vertices,
-        np.zeros_like(vertices),
-        faces,
-        solid(vertices),
-        np.ones((len(vertices), 3)),
-        0.005,
-        counts(0),
-    )
+    made = revoxelised(subject, vertices, np.zeros_like(vertices), faces, solid(vertices), counts(0))
     radius = np.linalg.norm(surface(subject, made).vertices, axis=1)
     np.testing.assert_allclose(radius, 0.3 * 0.6, atol=0.1 * CELL)
 
@@ -153,17 +129,7 @@ def test_a_loop_that_closes_however_little_moves_costs_nothing_of_the_movement()
     logits = np.where(vertices[:, 2] > 0, beside - 0.11, 8) / CELL
     pull = np.where(vertices[:, 2] > 0, 0.9 * np.clip(2 - beside / 0.11, 0, 1), 0)
     moved = 1.1 * np.column_stack([vertices[:, :2] * (1 - pull)[:, None], vertices[:, 2]])
-    made = revoxelise(
-        subject,
-        subject.lattice,
-        vertices,
-        moved,
-        faces,
-        logits,
-        np.ones((len(vertices), 3)),
-        0.005,
-        counts(1),
-    )
+    made = revoxelised(subject, vertices, moved, faces, logits, counts(1))
     found = surface(subject, made)
     assert not made.has_loops and found.is_watertight
     low = found.vertices[found.vertices[:, 2] < 0]
@@ -213,9 +179,7 @@ def test_a_slit_that_closes_becomes_a_bridge():
     moved[:, 0], moved[:, 1] = radius * np.cos(closed), radius * np.sin(closed) * np.sign(angle)
     cut = topology(*positive_part(vertices, faces, logits))
     assert cut.boundary_loops == 1
-    made = revoxelise(
-        subject, subject.lattice, vertices, moved, faces, logits, np.ones((len(vertices), 3)), 0.005, cut
-    )
+    made = revoxelised(subject, vertices, moved, faces, logits, cut)
     found = surface(subject, made)
     after = topology(found.vertices, found.faces)
     assert (after.boundary_loops, after.pinholes, after.components) == (2, 0, 1)

@@ -4,17 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from silent_steps import Silent
 
 from gshell_mi.fit.judge import Verdict
 from gshell_mi.fit.stages import revoxelise
-
-
-class Steps:
-    def __init__(self):
-        self.facts = {}
-
-    def fact(self, name, value):
-        self.facts[name] = value
 
 
 def fit(gain: float) -> SimpleNamespace:
@@ -50,12 +43,12 @@ def surface(name: str) -> SimpleNamespace:
 def test_views_decide_on_what_has_closed_a_loop(made, gain, stage, judged, monkeypatch):
     found = ((surface(name), by, has_loops) for name, by, has_loops in made)
     monkeypatch.setattr(revoxelise, "_made", lambda *given: found)
-    steps = Steps()
+    steps = Silent()
     assert revoxelise._taken(fit(gain), None, (), surface("whole"), steps)[1] == stage
     assert ("closed_loops_verdict" in steps.facts) == judged
 
 
 def test_what_nothing_comes_of_stays_as_it_is(monkeypatch):
     monkeypatch.setattr(revoxelise, "_made", lambda *given: iter(()))
-    kept, stage = revoxelise._taken(fit(9), None, (), surface("whole"), Steps())
+    kept, stage = revoxelise._taken(fit(9), None, (), surface("whole"), Silent())
     assert (kept.fields, stage) == ("whole", "")
