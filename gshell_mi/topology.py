@@ -139,6 +139,15 @@ def equal_patches(labels: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return vertex_components(edges[same], len(labels))[1]
 
 
+def inner(chosen: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V,) which ``chosen`` vertices have only such neighbours.
+
+    >>> inner(np.array([False, True, True, True]), np.array([[0, 1, 2], [1, 3, 2]])).tolist()
+    [False, False, False, True]
+    """
+    return ~spread(~chosen, mesh_edges(faces)[0])
+
+
 def lobes(chosen: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V,) ids of the connected patches of chosen and of other vertices, those that are chosen split at their
     necks."""

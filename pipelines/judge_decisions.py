@@ -15,7 +15,6 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,10 +24,11 @@ import trimesh
 from scipy.spatial import cKDTree
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(REPOSITORY / "pipelines"), str(REPOSITORY)]
+sys.path[:0] = [str(REPOSITORY / name) for name in ("pipelines", "", "tests")]
 
 from fit_study.command import add_scene_arguments  # noqa: E402
 from fit_study.settings import parsed_settings  # noqa: E402
+from silent_steps import Silent  # noqa: E402
 
 from gshell_mi.doctor import ensure_variant  # noqa: E402
 from gshell_mi.evaluation.mesh_scores import mesh_scores  # noqa: E402
@@ -127,32 +127,6 @@ class Change:
         true = "same" if abs(better) < _SAME else "better" if better > 0 else "worse"
         change = f"{self.before:.3f} → {self.after:.3f}"
         return f"| {scene} | {self.stage} | {gains} | {said} | {change} | {true} |"
-
-
-class Silent:
-    """Steps of a stage without a runner."""
-
-    def __init__(self) -> None:
-        self.kept, self.done = {}, 0
-
-    @contextmanager
-    def task(self, name: str = "", total: int | None = None) -> Iterator[Callable[[], None]]:
-        """Shows nothing."""
-        yield lambda: None
-
-    def fact(self, name: str, value: object) -> None:
-        """Keeps nothing."""
-
-    def run(self, work, count: int, *_: object, stalled=lambda done: False, **__: object) -> None:
-        """All steps."""
-        for iteration in range(count):
-            if stalled(iteration):
-                return
-            work.step(iteration)
-
-    def repeat(self, work, count: int, first: int) -> None:
-        """All steps once more."""
-        self.run(work, count)
 
 
 def chamfer(vertices: np.ndarray, faces: np.ndarray, truth: trimesh.Trimesh) -> float:

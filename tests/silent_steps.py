@@ -16,6 +16,11 @@ class Silent:
     def fact(self, name, value):
         self.facts[name] = value
 
-    def run(self, work, count, *_, **__):
+    def run(self, work, count, *_, stalled=lambda done: False, **__):
         for iteration in range(count):
+            if stalled(iteration):
+                return
             work.step(iteration)
+
+    def repeat(self, work, count, first):
+        self.run(work, count)

@@ -50,9 +50,7 @@ def converted(source: Source, side: int, *, most: float) -> Row:
     mesh, expected = source.mesh()
     mesh, _ = normalised(mesh, side)
     fields = TruncatedFields.of_mesh(mesh, side)
-    stored = TruncatedFields(
-        fields.sdf.astype(np.float16).astype(np.float32), fields.msdf.astype(np.float16).astype(np.float32)
-    )
+    stored = TruncatedFields.stored(fields.sdf.astype(np.float16), fields.msdf.astype(np.float16))
     again = stored.surface()
     if len(again.faces) == 0:
         raise UserError("leaves no surface on the grid; it is too small or thin")

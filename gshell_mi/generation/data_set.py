@@ -50,7 +50,7 @@ class Shard:
     """(k, 2048, 3) float16."""
 
     def fields(self, index: int) -> TruncatedFields:
-        return TruncatedFields(self.sdf[index].astype(np.float32), self.msdf[index].astype(np.float32))
+        return TruncatedFields.stored(self.sdf[index], self.msdf[index])
 
 
 @dataclass(frozen=True)

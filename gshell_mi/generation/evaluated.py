@@ -115,7 +115,8 @@ def evaluate(
         TimeRemainingColumn(),
     )
     with Bars(*columns, quiet=quiet) as progress:
-        bar = progress.add_task("", total=3 * len(a) + 2 * len(b))
+        matched = [of[:emd, :128] for of in (a, b)]
+        bar = progress.add_task("", total=4 * len(a) + 3 * len(b) + 3 * len(matched[0]))
 
         def advance() -> None:
             progress.advance(bar)
@@ -123,6 +124,18 @@ def evaluate(
         between = chamfer_distances(a, b, advance)
         among_a, among_b = (chamfer_distances(of, told=advance) for of in (a, b))
         to_trained, true_to_trained = (nearest_chamfer_distances(of, trained, told=advance) for of in (a, b))
+        true_rims = []
+        for i in theirs:
+            true_rims.append(rim_points(TruncatedFields.stored(sdf[i], msdf[i]).surface(), _RIM_POINTS))
+            advance()
+        rims, true_rims = (
+            np.array([rim for rim in found if len(rim)]).reshape(-1, _RIM_POINTS, 3)
+            for found in ((samples.rims[i] for i in mine), true_rims)
+        )
+        between_rims = chamfer_distances(rims, true_rims, advance)
+        moved, *moved_among = (
+            earth_movers_distances(matched[of], matched[to], advance) for of, to in ((0, 1), (0, 0), (1, 1))
+        )
     scores = {
         "samples": len(a),
         "true": len(b),
@@ -133,26 +146,14 @@ def evaluate(
         "nearest_training": float(to_trained.mean()),
         "nearest_training_of_true": float(true_to_trained.mean()),
     }
-    rims = [samples.rims[i] for i in mine if len(samples.rims[i])]
-    true_rims = [
-        rim_points(
-            TruncatedFields(sdf[i].astype(np.float32), msdf[i].astype(np.float32)).surface(), _RIM_POINTS
-        )
-        for i in theirs
-    ]
-    true_rims = [rim for rim in true_rims if len(rim)]
-    if rims and true_rims:
-        scores["mmd_boundary"] = minimum_matching_distance(
-            chamfer_distances(np.array(rims), np.array(true_rims))
-        )
+    if between_rims.size:
+        scores["mmd_boundary"] = minimum_matching_distance(between_rims)
     if emd:
-        a, b = a[:emd, :128], b[:emd, :128]
-        moved = earth_movers_distances(a, b)
         scores |= {
             "mmd_emd": minimum_matching_distance(moved),
             "coverage_emd": coverage(moved),
             "nearest_neighbour_accuracy_emd": nearest_neighbour_accuracy(
-                earth_movers_distances(a, a), moved, earth_movers_distances(b, b)
+                moved_among[0], moved, moved_among[1]
             ),
         }
     return (

@@ -59,6 +59,11 @@ class TruncatedFields:
         return len(self.sdf)
 
     @classmethod
+    def stored(cls, sdf: np.ndarray, msdf: np.ndarray) -> TruncatedFields:
+        """Those that a data set holds in half precision."""
+        return cls(sdf.astype(np.float32), msdf.astype(np.float32))
+
+    @classmethod
     def of_mesh(cls, mesh: trimesh.Trimesh, side: int) -> TruncatedFields:
         """Those of a mesh that lies in the cube as ``normalised`` puts it. Needs a Mitsuba variant.
 

@@ -102,8 +102,13 @@ def _to_nearest(query: Array3f, first: UInt32, cloud: Array3f, count: int) -> Fl
     return dr.sqrt(dr.while_loop(begin, lambda index, least: index < stop, body)[1])
 
 
-def earth_movers_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def earth_movers_distances(
+    a: np.ndarray, b: np.ndarray, told: Callable[[], None] = lambda: None
+) -> np.ndarray:
     """(len(a), len(b)) mean distances of the best one-to-one matching of (n, p, 3) and (m, p, 3) points.
+
+    Args:
+        told: called after each row.
 
     >>> earth_movers_distances(np.zeros((1, 4, 3)), np.ones((1, 4, 3))).round(3)
     array([[1.732]])
@@ -113,6 +118,7 @@ def earth_movers_distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         for j, others in enumerate(b):
             cost = cdist(points, others)
             found[i, j] = cost[linear_sum_assignment(cost)].mean()
+        told()
     return found
 
 

@@ -18,7 +18,7 @@ from ...fields.smoothing import MeshDiffusion
 from ...template.caps import dented, least_bent, put_in_place
 from ...template.msdf import clean_opacity, reopened, rewritten
 from ...template.sides import opposite_sides
-from ...topology import lobes
+from ...topology import inner, lobes
 from ...triangles import positive_part
 from ..judge import Judge, places_of
 from ..radiance.acceptance import CLOSINGS, WORST, close_rejected, close_shallow
@@ -103,8 +103,9 @@ def _closed(judge: Judge, template: Shown, values: np.ndarray, opposite: np.ndar
 
     Nothing has shaped the caps so far, and a hull's bulge explains too little to stand for a surface. Through
     one opening others are seen, a mouth through a hole in the bottom, so the worst closes alone before the
-    others are judged again. Where a sheet has one side, what closes the other one is a cell from it, and
-    looks alike.
+    others are judged again. Where an opening ends is found to a cell at best, so vertices at its rim tell
+    nothing; a false slit is little else. Where a sheet has one side, what closes the other one is a cell from
+    it, and looks alike.
 
     Args:
         judge: of the fit.
@@ -115,16 +116,19 @@ def _closed(judge: Judge, template: Shown, values: np.ndarray, opposite: np.ndar
     Returns:
         (V,) values, those of closed openings negated.
     """
-    thin = opposite >= 0
+    thin, faces = opposite >= 0, template.mesh[1]
     for closing in reversed(range(CLOSINGS)):
         chosen = values <= 0
         if not chosen.any():
             break
-        place = places_of(chosen, lobes(chosen, template.mesh[1]))
-        verdict = judge.compare(template.part(values), template.whole, place)
+        place = places_of(chosen, lobes(chosen, faces))
+        middle = np.where(inner(chosen, faces), place, -1)
+        verdict = judge.compare(template.part(values), template.whole, middle)
         backed = thin & (values[opposite] > 0)
         alone = 2 * np.bincount(place[chosen], backed[chosen]) <= np.bincount(place[chosen])
-        gain = np.where(np.isfinite(verdict.noise) & alone, verdict.gain + _STANDING * verdict.noise, 0)
+        gain = np.zeros(len(alone))
+        told = np.flatnonzero(np.isfinite(verdict.noise))
+        gain[told] = alone[told] * (verdict.gain + _STANDING * verdict.noise)[told]
         if gain.max() <= 0:
             break
         rejected = gain == gain.max() if closing else gain > 0

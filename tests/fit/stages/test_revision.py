@@ -14,7 +14,7 @@ from gshell_mi.fit.judge import Judge
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.hull import Hull
 from gshell_mi.fit.stages.revision import Revision, _closed
-from gshell_mi.topology import topology
+from gshell_mi.topology import inner, topology
 
 #: Fewer steps and pixels, as so small images need.
 SMALL = {
@@ -110,6 +110,21 @@ def test_an_opening_has_to_explain_more_by_its_noise(better, stays):
     values = np.where(opened, -1.0, 1.0)
     closed = _closed(judge, judge.shown((ball.vertices, ball.faces)), values, np.full(len(values), -1))
     np.testing.assert_array_equal(closed <= 0, opened & stays)
+
+
+@pytest.mark.parametrize(("better", "stays"), [(0.5, True), (-0.5, False)])
+def test_the_rim_of_an_opening_does_not_speak_for_it(better, stays):
+    """A slit of which all but the middle explains more than its cap; its middle explains more or less."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    x, y, z = ball.vertices.T
+    slit = (z > 0) & (np.abs(y) < 0.7) & (np.abs(x) < 0.13)
+    middle = inner(slit, ball.faces)
+    assert 0 < middle.sum() < slit.sum() / 2
+    worse = np.where(middle, better, 2.0)
+    judge = ScriptedJudge(len(ball.vertices), lambda opaque: np.exp(np.where(opaque, worse, 0.0)))
+    template, values = judge.shown((ball.vertices, ball.faces)), np.where(slit, -1.0, 1.0)
+    found = _closed(judge, template, values, np.full(len(values), -1))
+    np.testing.assert_array_equal(found <= 0, slit & stays)
 
 
 def vertices_of(fit, surface):
