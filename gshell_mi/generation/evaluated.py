@@ -115,8 +115,8 @@ def evaluate(
         TimeRemainingColumn(),
     )
     with Bars(*columns, quiet=quiet) as progress:
-        matched = [of[:emd, :128] for of in (a, b)]
-        bar = progress.add_task("", total=4 * len(a) + 3 * len(b) + 3 * len(matched[0]))
+        few_a, few_b = (of[:emd, :128] for of in (a, b))
+        bar = progress.add_task("", total=4 * len(a) + 3 * len(b) + 3 * len(few_a))
 
         def advance() -> None:
             progress.advance(bar)
@@ -133,8 +133,9 @@ def evaluate(
             for found in ((samples.rims[i] for i in mine), true_rims)
         )
         between_rims = chamfer_distances(rims, true_rims, advance)
-        moved, *moved_among = (
-            earth_movers_distances(matched[of], matched[to], advance) for of, to in ((0, 1), (0, 0), (1, 1))
+        moved, moved_a, moved_b = (
+            earth_movers_distances(*pair, advance)
+            for pair in ((few_a, few_b), (few_a, few_a), (few_b, few_b))
         )
     scores = {
         "samples": len(a),
@@ -152,9 +153,7 @@ def evaluate(
         scores |= {
             "mmd_emd": minimum_matching_distance(moved),
             "coverage_emd": coverage(moved),
-            "nearest_neighbour_accuracy_emd": nearest_neighbour_accuracy(
-                moved_among[0], moved, moved_among[1]
-            ),
+            "nearest_neighbour_accuracy_emd": nearest_neighbour_accuracy(moved_a, moved, moved_b),
         }
     return (
         scores
