@@ -6,10 +6,12 @@ python pipelines/compare_encodings.py [--garments 100] [--side 64] [--seed 1] [-
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import trimesh
 import tyro
 
 from gshell_mi.doctor import ensure_variant
@@ -52,27 +54,38 @@ def main() -> None:
     print("| encoding | numbers | chamfer, mean (%) | worst (%) | loops right (%) | decoding (s) |")
     print("|---|---|---|---|---|---|")
     for name, encoding in ENCODINGS.items():
-        codes = [encoding.encode(row.fields) for row in kept]
-        numbers = np.mean([sum(array.size for array in code.values()) for code in codes])
-        _row(name, numbers, meshes, lambda i, e=encoding, c=codes: e.decode(c[i], given.side))
+        codes = (encoding.encode(row.fields) for row in kept)
+        _row(name, meshes, codes, lambda code, e=encoding: e.decode(code, given.side))
     if given.model is not None:
         fields = np.stack([np.stack([row.fields.sdf, row.fields.msdf]) for row in kept])
         again, numbers = in_own_process(coded, given.model, fields)
-        _row("in the model", numbers, meshes, lambda i: TruncatedFields(*again[i]))
+        _row("in the model", meshes, again, lambda pair: TruncatedFields(*pair), numbers)
 
 
-def _row(name: str, numbers: float, meshes: list, decoded) -> None:
-    chamfer, right, seconds = [], [], 0.0
-    for index, mesh in enumerate(meshes):
+def _row(
+    name: str,
+    meshes: list[trimesh.Trimesh],
+    codes: Iterable,
+    decode: Callable[..., TruncatedFields],
+    numbers: int | None = None,
+) -> None:
+    """Prints a row of the table. Codes are made one by one: those of a thousand garments fill a memory.
+
+    Args:
+        numbers: of each code; default: they are counted.
+    """
+    counts, chamfer, right, seconds = [], [], [], 0.0
+    for mesh, code in zip(meshes, codes, strict=True):
+        counts.append(numbers if numbers is not None else sum(array.size for array in code.values()))
         begun = time.process_time()
-        fields = decoded(index)
+        fields = decode(code)
         seconds += time.process_time() - begun
         again = fields.surface(largest=True)
         chamfer.append(round_trip(again, mesh))
         true, found = (topology(np.asarray(m.vertices), np.asarray(m.faces)) for m in (mesh, again))
         right.append((true.boundary_loops, true.components) == (found.boundary_loops, found.components))
     print(
-        f"| {name} | {numbers:.0f} | {np.mean(chamfer):.4f} | {np.max(chamfer):.4f} | "
+        f"| {name} | {np.mean(counts):.0f} | {np.mean(chamfer):.4f} | {np.max(chamfer):.4f} | "
         f"{100 * np.mean(right):.1f} | {seconds / len(meshes):.3f} |",
         flush=True,
     )

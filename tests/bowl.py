@@ -109,11 +109,11 @@ def sensors_xml(views: int = VIEWS, size: int = SIZE) -> list[str]:
     ]
 
 
-def write_scene(folder: Path) -> Path:
+def write_scene(folder: Path, views: int = VIEWS) -> Path:
     """Writes ``bowl.xml`` and ``bowl/reference.xml`` without targets; returns the former."""
     (folder / "bowl").mkdir(parents=True)
     _write_truth(folder / "bowl" / "truth.ply")
-    sensors = "\n".join(sensors_xml())
+    sensors = "\n".join(sensors_xml(views))
     light = '<emitter type="constant" id="light"/>'
     path = folder / "bowl.xml"
     path.write_text(f"""\
@@ -157,9 +157,9 @@ def _write_truth(path: Path) -> None:
     mesh.write_ply(str(path))
 
 
-def write_fit_scene(folder: Path) -> Path:
+def write_fit_scene(folder: Path, views: int = VIEWS) -> Path:
     """The same with targets and without the reference."""
-    path = write_scene(folder)
+    path = write_scene(folder, views)
     truth = mi.load_file(str(folder / "bowl" / "reference.xml"))
     for index, sensor in enumerate(truth.sensors()):
         image = mi.render(truth, sensor=index, spp=64, seed=index)

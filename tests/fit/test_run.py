@@ -13,15 +13,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from bowl import CLOSED, RADIUS, SHORT, SIZE, VIEWS, write_scene
+from bowl import CLOSED, RADIUS, SHORT, SIZE, VIEWS, write_fit_scene, write_scene
 from topology import assert_manifold, loop_count
 
 from gshell_mi.fit.__main__ import main
+from gshell_mi.fit.config import FitConfig
 
 
 def fit(scene: Path, output: Path, *arguments: str) -> int:
     return main([str(scene), "-o", str(output), "--quiet", *SHORT, *arguments])
 
+
+#: Views that leave no doubt that the bowl is open; of those twelve it is a close call.
+MANY = 20
 
 COMMAND = ("-m", "gshell_mi.fit")
 ONE_THREAD = (str(Path(__file__).parents[2] / "pipelines" / "one_thread_fit.py"),)
@@ -74,10 +78,11 @@ def mesh(output: Path) -> trimesh.Trimesh:
 
 
 @pytest.fixture(scope="module")
-def whole(bowl_scene, tmp_path_factory) -> Path:
+def whole(tmp_path_factory) -> Path:
     """The folder of a fit that nothing interrupted."""
-    output = tmp_path_factory.mktemp("whole") / "out"
-    assert fit(bowl_scene, output) == 0
+    folder = tmp_path_factory.mktemp("whole")
+    output = folder / "out"
+    assert fit(write_fit_scene(folder, MANY), output) == 0
     return output
 
 
@@ -94,7 +99,8 @@ def test_folder_is_complete(whole):
     }
     assert expected <= {path.name for path in whole.iterdir()}
     assert not list(whole.glob(".*")), "no partial files"
-    assert {path.stem for path in (whole / "views").iterdir()} == {f"view_{i:03}" for i in range(VIEWS)}
+    shown = {path.stem for path in (whole / "views").iterdir()}
+    assert shown < {f"view_{i:03}" for i in range(MANY)} and len(shown) == FitConfig().triptychs
 
 
 def test_the_bowl_is_open(whole):
