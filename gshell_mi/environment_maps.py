@@ -7,7 +7,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from .errors import UserError
+from .errors import UserError, last_line
 from .float_images import first_not_finite, read_float_image
 
 
@@ -28,9 +28,8 @@ def read_environment_map(path: Path, name: str) -> np.ndarray:
     try:
         pixels, channels = read_float_image(path)
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
         raise UserError(
-            f"{name} '{path}' cannot be read as an image ({reason}); give a latitude-longitude "
+            f"{name} '{path}' cannot be read as an image ({last_line(error)}); give a latitude-longitude "
             f"environment map such as an OpenEXR file."
         ) from error
     if bad := first_not_finite(pixels):
@@ -48,7 +47,7 @@ def environment_emitter(path: Path, name: str) -> mi.Emitter:
     try:
         return mi.load_dict({"type": "envmap", "id": "light", "bitmap": mi.Bitmap(radiance)})
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
         raise UserError(
-            f"{name} '{path}' is no environment map ({reason}); give a latitude-longitude image in OpenEXR."
+            f"{name} '{path}' is no environment map ({last_line(error)}); give a latitude-longitude image "
+            f"in OpenEXR."
         ) from error

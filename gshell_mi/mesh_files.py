@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from .errors import last_line
+
 
 def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) and faces (F, 3) of a mesh file that trimesh reads, as they are stored.
@@ -17,7 +19,7 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh's readers raise whatever they stumble over
-        raise ValueError(f"cannot be read as a triangle mesh ({_line(error)})") from error
+        raise ValueError(f"cannot be read as a triangle mesh ({last_line(error)})") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError("holds no triangles")
     return check_triangles(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64))
@@ -44,7 +46,3 @@ def check_triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     if not np.cross(b - a, c - a).any():
         raise ValueError("holds no triangles with an area")
     return vertices, faces
-
-
-def _line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[-1]

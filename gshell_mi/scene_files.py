@@ -18,7 +18,7 @@ import mitsuba as mi
 
 from .compat import MITSUBA_INTEGRATORS, mitsuba_folder, trust_only_own_plugins
 from .environment_maps import read_environment_map
-from .errors import UserError
+from .errors import UserError, first_line, last_line
 from .float_images import check_for_mitsuba, is_exr, read_float_image
 
 #: Python plugins of this package.
@@ -187,7 +187,6 @@ def _is_plain_exr(path: Path) -> bool:
 
 def _reason(error: Exception) -> str:
     """The one line of Mitsuba's message that says what is wrong."""
-    lines = str(error).strip().splitlines() or [repr(error)]
     # A plugin's own complaint comes below the traceback that Mitsuba puts into its message.
-    _, found, complaint = lines[-1].partition(f"{UserError.__name__}: ")
-    return (complaint if found else lines[0]).rstrip(". ")
+    _, found, complaint = last_line(error).partition(f"{UserError.__name__}: ")
+    return (complaint if found else first_line(error)).rstrip(". ")

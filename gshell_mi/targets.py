@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import UserError
+from .errors import UserError, first_line
 from .float_images import first_not_finite, read_float_image
 
 #: Coverage above 1 by more than this is an error; below, rounding of half floats and filter lobes.
@@ -72,7 +72,7 @@ def load_target(path: Path, width: int, height: int) -> Target:
         pixels, channels = read_float_image(path)
     except Exception as error:
         raise UserError(
-            f"Target '{path}' cannot be read as an image ({_first_line(error)}); write it again "
+            f"Target '{path}' cannot be read as an image ({first_line(error)}); write it again "
             f"as an OpenEXR file: a target needs R, G, B and A (or R, G and B)."
         ) from error
     if channels not in ("RGB", "RGBA"):
@@ -179,7 +179,7 @@ def _one_channel(path: Path, name: str, meaning: str, width: int, height: int) -
         values = read_float_image(path)[0]
     except Exception as error:
         raise UserError(
-            f"{name} '{path}' cannot be read as an image ({_first_line(error)}); write it again "
+            f"{name} '{path}' cannot be read as an image ({first_line(error)}); write it again "
             f"as an OpenEXR file."
         ) from error
     if values.shape[2] > 1 and (values != values[..., :1]).any():
@@ -190,7 +190,3 @@ def _one_channel(path: Path, name: str, meaning: str, width: int, height: int) -
             f"film is {width} x {height}; resize one of them."
         )
     return values[..., 0]
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

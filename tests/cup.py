@@ -22,7 +22,7 @@ from gshell_mi.views import PinholeViews
 #: Half the side of the block, how thick the walls are, and the views' pixels per side.
 HALF, WALL, SIZE = 0.6, 0.15, 64
 
-CONFIG = FitConfig(cavities=CavitiesConfig(iterations=200, batch=16384), radiance=RadianceConfig(batch=8192))
+CONFIG = FitConfig(cavities=CavitiesConfig(iterations=400, batch=32768), radiance=RadianceConfig(batch=8192))
 
 
 def block(low, high) -> trimesh.Trimesh:

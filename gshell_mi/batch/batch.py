@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from ..bars import Bars
-from ..errors import UserError
+from ..errors import UserError, first_line
 from ..files import replacing
 from ..interrupt import check_interrupt
 from ..own_folder import OwnFolder, own_folder
@@ -101,7 +101,7 @@ def _run_all(
     except Exception as error:  # Ray raises whatever it stumbles over
         if not address:
             raise UserError(
-                f"Ray cannot start on this machine ({_first_line(error)}); give it more memory, or name a "
+                f"Ray cannot start on this machine ({first_line(error)}); give it more memory, or name a "
                 f"cluster with --address."
             ) from error
         raise UserError(
@@ -162,10 +162,6 @@ def _outcome(ray, reference, job: Job) -> dict:
         }
     except Exception as error:  # what the job's function raised, as where storage cannot be written
         return {"name": job.name, "status": "failed", "code": None, "seconds": 0.0, "told": str(error)}
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
 def _write(folder: OwnFolder, name: str, text: str) -> None:

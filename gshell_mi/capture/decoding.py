@@ -14,7 +14,7 @@ from PIL import ExifTags, ImageCms
 
 from .. import float_images
 from ..compat import colour_science
-from ..errors import UserError
+from ..errors import UserError, last_line
 from ..integer_images import integer_image_size, open_image, read_integer_image
 from . import tiff
 
@@ -97,8 +97,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return UserError(f"Image '{path}' cannot be read ({lines[-1]}); copy or export it again.")
+    return UserError(f"Image '{path}' cannot be read ({last_line(error)}); copy or export it again.")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from PIL import Image
 
-from ..errors import UserError
+from ..errors import UserError, first_line
 
 
 def object_probability(image: np.ndarray) -> np.ndarray:
@@ -33,8 +33,7 @@ def _session() -> tuple:
     try:
         return rembg, rembg.new_session("u2net")
     except Exception as error:  # a download that fails, by whatever library does it
-        reason = (str(error).strip().splitlines() or [repr(error)])[0]
         raise UserError(
-            f"rembg's model cannot be had ({reason}); connect to the internet once, put the "
+            f"rembg's model cannot be had ({first_line(error)}); connect to the internet once, put the "
             f"model where rembg looks for it, or choose --make-masks grabcut."
         ) from error

@@ -10,7 +10,7 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 from ..compat import colour_science
-from ..errors import UserError
+from ..errors import UserError, first_line
 from ..float_images import image_size
 from ..images import over_white, psnr
 from ..targets import Target, load_target
@@ -48,8 +48,9 @@ def read_image(path: Path) -> np.ndarray:
     try:
         size = image_size(path)
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise UserError(f"Image '{path}' cannot be read ({reason}); write it again as OpenEXR.") from error
+        raise UserError(
+            f"Image '{path}' cannot be read ({first_line(error)}); write it again as OpenEXR."
+        ) from error
     return load_target(path, *size).rgba
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from ..errors import UserError
+from ..errors import UserError, last_line
 from ..files import replacing
 from ..mesh_files import check_triangles
 
@@ -89,8 +89,9 @@ def read_ply(path: Path) -> FittedMesh:
             attributes.setdefault(stem, []).append((int(channel), columns[name]))
         _check(mesh, stacked, columns, attributes)
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-        raise UserError(f"'{path}' cannot be read as a fitted mesh ({reason}); run the fit again.") from error
+        raise UserError(
+            f"'{path}' cannot be read as a fitted mesh ({last_line(error)}); run the fit again."
+        ) from error
     return FittedMesh(
         stacked["p"],
         np.asarray(mesh.faces, np.int64),

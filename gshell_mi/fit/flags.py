@@ -25,7 +25,8 @@ _MOVED = {
     "hull": _without("hull-", "daylight-votes"),
     "radiance": _without("ghost-", "batch lr smoothing") | {"ghost-sheets": "layers"},
     "openings": _without("ghost-", "iterations mask daylight binary closing chroma rounds"),
-    "cavities": _without("carving-", "iterations batch lr radiance-lr"),
+    "cavities": _without("carving-", "iterations batch radiance-lr")
+    | dict.fromkeys(("carving-lr", "cavities.lr"), "density-lr"),
     "refinement": _without("refinement-", "iterations lr smoothing detail radiance-lr outline"),
     "folds": _without("folds-", "iterations lr detail descent"),
     "volume": _without(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import UserError
+from ..errors import UserError, last_line
 from ..export.asset import y_up_turn
 from ..export.gltf import Part, glb_bytes, read_part
 from ..export.ply import read_ply
@@ -82,8 +82,9 @@ def _subject(path: Path) -> tuple[bytes, Part]:
             raise ValueError("its normals are not as many as its vertices")
         return base, subject
     except Exception as error:  # anything may be where a number should be
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-        raise UserError(f"'{path}' is damaged ({reason}); delete it and make the report again.") from error
+        raise UserError(
+            f"'{path}' is damaged ({last_line(error)}); delete it and make the report again."
+        ) from error
 
 
 def back_faces(positions: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> Part:

@@ -1,1 +1,1 @@
-"""A fog of radiance inside the hull: finds what the hull bridges."""
+"""Hollows: what a radiance volume in the hull, or walls behind openings, show of what the hull bridges."""

@@ -14,17 +14,20 @@ from ...topology import topology
 from ...triangles import positive_part
 from ..radiance.acceptance import close_rejected
 from ..radiance.on_template import fitted_radiance
+from ..radiance.volume import RadianceVolume
 from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import Template, template_of
-from .density_grid import DensityGrid
-from .hollows import SEEN, hollowed, hollows
+from .hollows import hollowed, hollows
 
 #: Space is empty below this opacity of a cell.
 _EMPTY = 0.3
 
+#: Views that have to see a vertex: one alone does not know how far away what it sees is.
+_SEEING = 2
 
-def carve(fit: Fit, surface: Surface, volume: DensityGrid) -> Surface | None:
+
+def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
     """Hollows out a template as far as held-out views are explained better.
 
     Args:
@@ -38,7 +41,7 @@ def carve(fit: Fit, surface: Surface, volume: DensityGrid) -> Surface | None:
     """
     subject, lattice, min_area = fit.scene.subject, surface.lattice, fit.config.topology.min_area
     shape = (lattice.stride,) * 3
-    opacity, seen = volume.opacity(), volume.seen()
+    opacity, seen = opacity_and_visibility(volume, surface, subject.to_world)
     in_cells = (field.reshape(shape) / lattice.spacing for field in (surface.hull, surface.fields.msdf))
     distance = hollows(*in_cells, opacity, seen)
     if distance is None:
@@ -52,7 +55,7 @@ def carve(fit: Fit, surface: Surface, volume: DensityGrid) -> Surface | None:
     label = np.where(label, label, ndimage.maximum_filter(label, size=3))
     # Vertices beside a hollow belong to it.
     owner = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
-    kept = _kept(fit, before, after, label, volume)
+    kept = _kept(fit, before, after, label)
     if not kept.any():
         return None
     if not kept.all():
@@ -69,7 +72,7 @@ def carve(fit: Fit, surface: Surface, volume: DensityGrid) -> Surface | None:
         return None
     if not fit.config.watertight:
         # Now that what lies behind is in its place, the images may justify more openings.
-        proposed = clean(np.where(_in_empty_space(after, volume, opacity, seen), -CERTAIN, cleaned))
+        proposed = clean(np.where(_in_empty_space(after, subject.to_world, opacity, seen), -CERTAIN, cleaned))
         closed = fit.judge.shown(after.closed)
         justified = close_rejected(proposed, closed, fit.judge, closed.whole)
         # Those that there were have been judged, and a close call may come out otherwise now.
@@ -80,22 +83,52 @@ def carve(fit: Fit, surface: Surface, volume: DensityGrid) -> Surface | None:
     return replace(carved.with_fields(msdf=msdf.numpy()), seen=seen)
 
 
+def opacity_and_visibility(
+    volume: RadianceVolume, surface: Surface, to_world: mi.ScalarTransform4f
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a volume says of the N^3 vertices of a surface's lattice. Away from the hull they are empty, and
+    seen.
+
+    Args:
+        volume: trained.
+        surface: with its hull, on a lattice whose vertices make a cube.
+        to_world: from the lattice.
+
+    Returns:
+        (N, N, N) opacities of a cell's length in [0, 1], z by y by x, and (N, N, N) whether a vertex is seen.
+    """
+    lattice = surface.lattice
+    near = np.flatnonzero(surface.hull < 2 * lattice.spacing)
+    points = mi.Transform4f(to_world) @ mi.Point3f(lattice.points(mi.Float).numpy()[:, near])
+    opacity, seen = np.zeros(lattice.vertex_count, np.float32), np.ones(lattice.vertex_count, bool)
+    opacity[near] = volume.opacity_at(points, lattice.spacing).numpy()
+    seen[near] = volume.views_seeing(points).numpy() >= _SEEING
+    shape = (lattice.stride,) * 3
+    return opacity.reshape(shape), seen.reshape(shape)
+
+
+def _on_lattice(template: Template, to_world: mi.ScalarTransform4f, side: int) -> np.ndarray:
+    """(3, V) indices z, y, x of vertices in a cube of ``side`` cells, with fractions."""
+    local = mi.Transform4f(to_world).inverse() @ mi.Point3f(
+        np.ascontiguousarray(template.vertices.T, np.float32)
+    )
+    return ((local + 1) * (0.5 * side)).numpy()[::-1]
+
+
 def _in_empty_space(
-    template: Template, volume: DensityGrid, opacity: np.ndarray, seen: np.ndarray
+    template: Template, to_world: mi.ScalarTransform4f, opacity: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
     """(V,) whether there is nothing within a cell of a vertex, and it is seen."""
-    local = volume.to_lattice @ mi.Point3f(np.ascontiguousarray(template.vertices.T, np.float32))
-    index = ((local + 1) * (0.5 * volume.resolution)).numpy()[::-1]
+    index = _on_lattice(template, to_world, len(opacity) - 1)
     around = ndimage.gaussian_filter(opacity, 1.0)
-    return (ndimage.map_coordinates(around, index, order=1) < _EMPTY) & (
-        ndimage.map_coordinates(seen, index, order=1) > SEEN
+    return (ndimage.map_coordinates(around, index, order=1) < _EMPTY) & ndimage.map_coordinates(
+        seen, index, order=0
     )
 
 
-def _kept(fit: Fit, before: Template, after: Template, label: np.ndarray, volume: DensityGrid) -> np.ndarray:
+def _kept(fit: Fit, before: Template, after: Template, label: np.ndarray) -> np.ndarray:
     """(count,) which hollows explain unseen views better, by the rays that enter them."""
-    local = volume.to_lattice @ mi.Point3f(np.ascontiguousarray(before.vertices.T, np.float32))
-    index = np.rint(((local + 1) * (0.5 * volume.resolution)).numpy()[::-1]).astype(int)
+    index = np.rint(_on_lattice(before, fit.scene.subject.to_world, len(label) - 1)).astype(int)
     place = label[tuple(np.clip(index, 0, len(label) - 1))] - 1
     verdict = fit.judge.compare(
         fit.judge.shown(before.surface).whole,

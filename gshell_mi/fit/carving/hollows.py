@@ -23,10 +23,7 @@ _DEPTH, _LEAST = 0.4, 0.03
 #: What it costs to leave outside a vertex that is opaque or not seen: as much as one cut in empty space.
 _HIDDEN = 1.0
 
-#: A vertex is seen if this fraction of the rays that come near reach it ...
-SEEN = 0.03
-
-#: ... and opaque from this opacity of a cell on.
+#: A vertex is opaque from this opacity of a cell on.
 _OPAQUE = 0.5
 
 #: Vertices up to this many cells below an opening are inside, at this cost.
@@ -49,7 +46,7 @@ def hollows(hull: np.ndarray, msdf: np.ndarray, opacity: np.ndarray, seen: np.nd
         hull: (n, n, n) signed distances to the hull, in cells.
         msdf: (n, n, n) negative at its openings.
         opacity: (n, n, n) of a cell's length.
-        seen: (n, n, n) fraction of rays that reach a vertex.
+        seen: (n, n, n) whether a vertex is seen.
 
     Returns:
         (n, n, n) signed distances, in cells, positive in the hollows, -inf far from them: the carved solid's
@@ -57,7 +54,7 @@ def hollows(hull: np.ndarray, msdf: np.ndarray, opacity: np.ndarray, seen: np.nd
     """
     inside = hull < 0
     lid = inside & (msdf < 0) & (hull > -_LID)
-    solid = _minimum_cut(inside, lid, opacity, (seen < SEEN) | (opacity > _OPAQUE))
+    solid = _minimum_cut(inside, lid, opacity, ~seen | (opacity > _OPAQUE))
     air = ndimage.binary_opening(~solid, ndimage.generate_binary_structure(3, 1))
     hollow = inside & air
     hollow = ndimage.binary_propagation(hollow & (hull < -_SHALLOW), mask=hollow)

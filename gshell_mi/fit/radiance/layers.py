@@ -1,4 +1,4 @@
-"""The sheets of a template that rays meet one behind the other."""
+"""The layers of a template that rays meet one behind the other."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def interpolated(
 
 
 @dataclass
-class Sheet:
+class Layer:
     """Where rays meet a template for the first time, the second, and so on; one lane per ray that does.
 
     Attributes:
-        lane: of the ray among those of the sheet in front; among all rays for the first.
-        origin, direction: of the ray; the origin lies behind the sheet in front.
+        lane: of the ray among those of the layer in front; among all rays for the first.
+        origin, direction: of the ray; the origin lies behind the layer in front.
         face: vertex indices of the triangle.
         weights: barycentric.
         front: whether the ray comes from the side that the triangle's normal points to.
@@ -66,23 +66,23 @@ def trace_layers(
     ray: mi.Ray3f,
     count: int,
     offset: float,
-    goes_on: Callable[[Sheet], mi.Bool] | None = None,
-) -> list[Sheet]:
-    """The first sheets along each ray.
+    goes_on: Callable[[Layer], mi.Bool] | None = None,
+) -> list[Layer]:
+    """The first layers along each ray.
 
     Only the rays that go on are traced any further, and only hits have lanes: of a closed template every ray
-    that hits has a second sheet, but few have a fourth.
+    that hits has a second layer, but few have a fourth.
 
     Args:
         scene: of the template alone.
         positions: (3 V,) of its vertices.
         faces: its triangles.
         ray: to follow.
-        count: of sheets, at most.
-        offset: between a sheet and where its ray goes on, world units.
-        goes_on: of a sheet, which of its rays pass it; None for all.
+        count: of layers, at most.
+        offset: between a layer and where its ray goes on, world units.
+        goes_on: of a layer, which of its rays pass it; None for all.
     """
-    sheets = []
+    layers = []
     origin, direction, active = ray.o, ray.d, mi.Bool(True)
     for _ in range(count):
         hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
@@ -94,9 +94,9 @@ def trace_layers(
         face = dr.gather(mi.Vector3u, faces, prim)
         a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in face)
         front = dr.dot(dr.cross(b - a, c - a), direction) < 0
-        sheet = Sheet(lane, origin, direction, face, mi.Vector3f(1 - uv.x - uv.y, uv.x, uv.y), front)
-        sheets.append(sheet)
-        active = goes_on(sheet) if goes_on else mi.Bool(True)
+        layer = Layer(lane, origin, direction, face, mi.Vector3f(1 - uv.x - uv.y, uv.x, uv.y), front)
+        layers.append(layer)
+        active = goes_on(layer) if goes_on else mi.Bool(True)
         origin = mi.Point3f(origin + direction * (t + offset))
-        dr.eval(sheet, origin, direction, active)
-    return sheets
+        dr.eval(layer, origin, direction, active)
+    return layers

@@ -21,7 +21,7 @@ from ...pixels import COVERED, PixelPool, PixelSample
 from ...template.normals import vertex_normals
 from ...views import PinholeViews
 from .lanes import chosen_lanes, joined_lanes
-from .layers import Sheet, interpolated, trace_layers
+from .layers import Layer, interpolated, trace_layers
 from .mirrored import Mirrored, mirrored_direction
 
 #: Batches of rays that tell the colours, and of rays that judge.
@@ -36,8 +36,8 @@ _ROUNDS = 2
 #: Lambda that spreads colours along a mesh to vertices that hardly a ray comes near.
 _SMOOTHING = 0.5
 
-#: Sheets of the mesh that a ray may pass.
-_SHEETS = 8
+#: Layers of the mesh that a ray may pass.
+_LAYERS = 8
 
 #: Vertices (V, 3) and faces (F, 3).
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -218,9 +218,9 @@ class Shown:
             if values is None:
                 return
             lane = chosen_lanes(~solid, solid)
-        for sheet in self._sheets(pixel.at(lane) if first else pixel, values):
-            lane = dr.gather(mi.UInt32, lane, sheet.lane)
-            met = self._met(sheet)
+        for layer in self._layers(pixel.at(lane) if first else pixel, values):
+            lane = dr.gather(mi.UInt32, lane, layer.lane)
+            met = self._met(layer)
             yield lane, replace(met, hit=met.values_at(values) > 0) if values is not None else met
 
     @cached_property
@@ -251,8 +251,8 @@ class Shown:
             sample = pixels.sample(self._batch, seed=self._seed, step=step)
             if covered:
                 sample = sample.at(chosen_lanes(sample.alpha > COVERED, sample))
-            for sheet in self._sheets(sample, None):
-                found.append(FirstHits(sample.at(sheet.lane), self._met(sheet)))
+            for layer in self._layers(sample, None):
+                found.append(FirstHits(sample.at(layer.lane), self._met(layer)))
                 dr.eval(found[-1])
         # Arrays are never empty: a pixel whose ray meets nothing.
         return joined_lanes(found) if found else FirstHits(pixels.sample(1, seed=0, step=0), Met.nothing())
@@ -282,7 +282,7 @@ class Shown:
         dr.eval(colors)
         return colors
 
-    def _sheets(self, pixel: PixelSample, values: mi.Float | None) -> list[Sheet]:
+    def _layers(self, pixel: PixelSample, values: mi.Float | None) -> list[Layer]:
         """What rays meet up to a part, or of the whole mesh."""
         if not dr.width(pixel.view):
             return []
@@ -294,18 +294,18 @@ class Shown:
             self._positions,
             self._faces,
             ray,
-            _SHEETS,
+            _LAYERS,
             self._offset,
-            lambda sheet: sheet.interpolate(values) <= 0,
+            lambda layer: layer.interpolate(values) <= 0,
         )
 
-    def _met(self, sheet: Sheet) -> Met:
-        normal = interpolated(mi.Vector3f, self._normals, sheet.face, sheet.weights)
+    def _met(self, layer: Layer) -> Met:
+        normal = interpolated(mi.Vector3f, self._normals, layer.face, layer.weights)
         return Met(
-            [sheet.side(corner) for corner in sheet.face],
-            list(sheet.weights),
-            mirrored_direction(dr.normalize(sheet.direction), normal),
-            dr.full(mi.Bool, True, dr.width(sheet.lane)),
+            [layer.side(corner) for corner in layer.face],
+            list(layer.weights),
+            mirrored_direction(dr.normalize(layer.direction), normal),
+            dr.full(mi.Bool, True, dr.width(layer.lane)),
         )
 
 

@@ -1,7 +1,7 @@
 """A radiance on a surface: which parts of a template are surface, found without a light model.
 
 Every vertex of the watertight template carries an opacity and one radiance per side, times what all of the
-surface mirrors. A pixel's ray composites the first few sheets that it meets front to back. Where the object
+surface mirrors. A pixel's ray composites the first few layers that it meets front to back. Where the object
 is open (the neck of a T-shirt, the rim of a hat) no single radiance of the template's cap agrees with what
 the views see through it, so the cap fades and the inner side behind it takes over. As there is neither a
 light nor a material, nothing can be traded for scale or shading, and a path tracer's noise is absent.
@@ -28,10 +28,10 @@ from ..bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from .contrast import Contrast
-from .layers import Sheet, interpolated, trace_layers
+from .layers import Layer, interpolated, trace_layers
 from .mirrored import Mirrored, mirrored_direction
 
-#: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the sheets behind, high
+#: Logit of opacity 0.35, where every vertex starts. Low enough that rays reach the layers behind, high
 #: enough that all are seen; colours fitted at full opacity would bleed what is inside into the caps.
 _INITIAL_LOGIT = float(np.log(0.35 / 0.65))
 
@@ -127,9 +127,9 @@ class SurfaceRadiance:
         self._set_opacity(np.where(opaque, _CERTAIN_LOGIT, -_CERTAIN_LOGIT))
         self._opacity_rests = True
         for step in range(_REFIT_STEPS):
-            sample, radiance, _, sheets = self.render(_EXTRA_STEP + step)
+            sample, radiance, _, layers = self.render(_EXTRA_STEP + step)
             # What is left of a template may be too small for any ray to meet.
-            if not sheets:
+            if not layers:
                 continue
             dr.backward(losses.l1(self.tone(radiance), self.tone(sample.radiance)))
             self.update(("radiance",), self.config.lr)
@@ -161,22 +161,22 @@ class SurfaceRadiance:
         self.optimizer["opacity"] = mi.Float(logits.astype(np.float32))
         self.optimizer.reset()
 
-    def render(self, step: int) -> tuple[PixelSample, mi.Color3f, mi.Float, list[Sheet]]:
-        """The random pixels of a step, their radiance and coverage, and the sheets behind them."""
-        sample, sheets = self.look(step)
-        radiance, alpha = self.composite(sheets, dr.width(sample.view))
+    def render(self, step: int) -> tuple[PixelSample, mi.Color3f, mi.Float, list[Layer]]:
+        """The random pixels of a step, their radiance and coverage, and the layers behind them."""
+        sample, layers = self.look(step)
+        radiance, alpha = self.composite(layers, dr.width(sample.view))
         # Each of the losses would do this again.
         dr.eval(radiance, alpha)
-        return sample, radiance, alpha, sheets
+        return sample, radiance, alpha, layers
 
-    def look(self, step: int) -> tuple[PixelSample, list[Sheet]]:
-        """The random pixels of a step, and the sheets that the rays through them meet."""
+    def look(self, step: int) -> tuple[PixelSample, list[Layer]]:
+        """The random pixels of a step, and the layers that the rays through them meet."""
         sample = self.pixels.sample(self.config.batch, seed=self.seed, step=step)
-        return sample, self._sheets(self.views.rays(sample.view, sample.film))
+        return sample, self._layers(self.views.rays(sample.view, sample.film))
 
     def see(self, ray: mi.Ray3f) -> tuple[mi.Color3f, mi.Float]:
         """Radiance and coverage along rays."""
-        return self.composite(self._sheets(ray), dr.width(ray.d))
+        return self.composite(self._layers(ray), dr.width(ray.d))
 
     def update(self, names: tuple[str, ...], rate: float) -> None:
         """Steps the parameters ``names``; the others rest.
@@ -219,18 +219,18 @@ class SurfaceRadiance:
             for side in range(2)
         )
 
-    def _sheets(self, ray: mi.Ray3f) -> list[Sheet]:
-        """The first sheets along each ray.
+    def _layers(self, ray: mi.Ray3f) -> list[Layer]:
+        """The first layers along each ray.
 
-        There are none behind sheets that let nothing through, unless their opacity is still to be found: for
+        There are none behind layers that let nothing through, unless their opacity is still to be found: for
         that, what they hide counts as well.
         """
         opacity, transmittance = dr.detach(self.optimizer["opacity"]), dr.full(mi.Float, 1, dr.width(ray.d))
 
-        def goes_on(sheet: Sheet) -> mi.Bool:
+        def goes_on(layer: Layer) -> mi.Bool:
             nonlocal transmittance
-            remaining = dr.gather(mi.Float, transmittance, sheet.lane)
-            transmittance = remaining * (1 - sigmoid(sheet.interpolate(opacity)))
+            remaining = dr.gather(mi.Float, transmittance, layer.lane)
+            transmittance = remaining * (1 - sigmoid(layer.interpolate(opacity)))
             dr.eval(transmittance)
             return transmittance > _NEGLIGIBLE
 
@@ -244,11 +244,11 @@ class SurfaceRadiance:
             goes_on if self._opacity_rests else None,
         )
 
-    def composite(self, sheets: list[Sheet], count: int) -> tuple[mi.Color3f, mi.Float]:
+    def composite(self, layers: list[Layer], count: int) -> tuple[mi.Color3f, mi.Float]:
         """Compositing (Porter and Duff 1984, *over*) of radiance and coverage.
 
         Args:
-            sheets: what the rays meet, from ``look``.
+            layers: what the rays meet, from ``look``.
             count: of rays.
 
         Returns:
@@ -258,24 +258,24 @@ class SurfaceRadiance:
         if self._opacity_rests:
             opacity = dr.detach(opacity)  # its derivatives would take as long as those of the radiance
         radiance, transmittance = mi.Color3f(0), mi.Float(1)
-        fronts = [count, *(dr.width(sheet.lane) for sheet in sheets)]
+        fronts = [count, *(dr.width(layer.lane) for layer in layers)]
         # From the last to the first: each has lanes of its own.
-        for sheet, width in reversed(list(zip(sheets, fronts, strict=False))):
-            sides = [sheet.side(corner) for corner in sheet.face]
-            color = interpolated(mi.Color3f, self.optimizer["radiance"], sides, sheet.weights)
+        for layer, width in reversed(list(zip(layers, fronts, strict=False))):
+            sides = [layer.side(corner) for corner in layer.face]
+            color = interpolated(mi.Color3f, self.optimizer["radiance"], sides, layer.weights)
             color = softplus(color)
             if self._mirrored:
-                mirrored = mirrored_direction(dr.normalize(sheet.direction), self._normal(sheet))
+                mirrored = mirrored_direction(dr.normalize(layer.direction), self._normal(layer))
                 color *= self._mirrored.factor(mirrored)
-            alpha = sigmoid(sheet.interpolate(opacity))
-            radiance = _spread(dr.lerp(radiance, color, alpha), sheet.lane, 0, width)
-            transmittance = _spread((1 - alpha) * transmittance, sheet.lane, 1, width)
+            alpha = sigmoid(layer.interpolate(opacity))
+            radiance = _spread(dr.lerp(radiance, color, alpha), layer.lane, 0, width)
+            transmittance = _spread((1 - alpha) * transmittance, layer.lane, 1, width)
         return radiance, 1 - transmittance
 
-    def _normal(self, sheet: Sheet) -> mi.Vector3f:
+    def _normal(self, layer: Layer) -> mi.Vector3f:
         """Smooth normals at hits, of any length."""
         # What depends on the view is to explain highlights, not to turn the surface.
-        return interpolated(mi.Vector3f, self._normals, sheet.face, dr.detach(sheet.weights))
+        return interpolated(mi.Vector3f, self._normals, layer.face, dr.detach(layer.weights))
 
     def _smooth_normals(self) -> mi.Float:
         """(3 V,) unit normals, as smooth as the other values at the vertices."""

@@ -7,7 +7,9 @@ leaves. A fog has no such start: it thins wherever the views disagree and thicke
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -20,12 +22,12 @@ from ...images import decibels
 from ...pixels import PixelPool
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
-from .config import VolumeConfig
+from .config import TrainingConfig
 from .contrast import Contrast
 from .marching import Adjoint, Rays, composite, depth_along
 
-#: Voxels per side of each level over those of the last one, and shares of the steps.
-_SIDES, _SHARES = (0.25, 0.5, 1.0), (0.29, 0.29, 0.42)
+#: Steps of the last level over those of each other one.
+_LAST = 1.5
 
 #: Neighbouring pixels that are drawn together: what they see is near in memory.
 _TOGETHER = 4
@@ -49,6 +51,9 @@ _SHARE = 0.1
 #: Batches of rays that look for them; random numbers apart from those of the steps.
 _SURVEY, _SURVEY_STEP = 16, 1 << 20
 
+#: Numbers per voxel of each parameter.
+_CHANNELS = {"density": 1, "radiance": 3, "direction": 9}
+
 #: Fraction of what depends on the direction that a step takes away: it explains gloss, and no geometry.
 _DIRECTION_DECAY = 0.002
 
@@ -57,9 +62,9 @@ class RadianceVolume:
     """Density and radiance in sparse voxels, trained on random pixels from coarse to fine.
 
     The radiance of a voxel is linear in the direction of the ray, but for the first level, where it does not
-    depend on it. Rays read one of the eight voxels around each sample at random, by the weights of the
-    trilinear interpolation (stochastic filtering): eight times fewer memory accesses, and the noise averages
-    out.
+    depend on it, as in all of a volume whose ``direction_lr`` is 0. Rays read one of the eight voxels around
+    each sample at random, by the weights of the trilinear interpolation (stochastic filtering): eight times
+    fewer memory accesses, and the noise averages out.
 
     Args:
         hull: (n, n, n) signed distances to the visual hull at the centres of the first level's voxels, in the
@@ -68,6 +73,7 @@ class RadianceVolume:
         views: the cameras.
         pixels: the targets' pixels.
         config: how it is trained.
+        sides: voxels per side of each level (``sides_of_levels``).
         surface: vertices (V, 3) and faces (F, 3) to show meanwhile, world units.
         stored: what ``arrays`` gave, of a run to go on with.
         seed: of all random numbers.
@@ -79,7 +85,8 @@ class RadianceVolume:
         to_world: mi.ScalarTransform4f,
         views: PinholeViews,
         pixels: PixelPool,
-        config: VolumeConfig,
+        config: TrainingConfig,
+        sides: Sequence[int],
         surface: tuple[np.ndarray, np.ndarray],
         stored: Mapping[str, np.ndarray] | None = None,
         *,
@@ -94,8 +101,9 @@ class RadianceVolume:
             mi.TensorXf(hull[..., None].astype(np.float32)), wrap_mode=dr.WrapMode.Clamp
         )
         self._reach = _OUTSIDE * 2 / len(hull)
-        self._sides = _sides(config)
-        counts = np.round(np.multiply(_SHARES, config.iterations))
+        self._sides = sides
+        shares = np.append(np.ones(len(sides) - 1), _LAST)
+        counts = np.round(shares / shares.sum() * config.iterations)
         #: The first step of each level, and the end of all.
         self._begins = [0, *(int(step) for step in np.cumsum(counts))]
         #: By name; another one on each level.
@@ -107,13 +115,8 @@ class RadianceVolume:
             self.level = 0
             near = hull < self._reach
             m = self._sides[0] // BRICK
-            zoom = len(hull) // m
-            self._begin(Bricks.where(near.reshape(m, zoom, m, zoom, m, zoom).any(axis=(1, 3, 5))))
-
-    @staticmethod
-    def first_side(config: VolumeConfig) -> int:
-        """Voxels per side of the first level."""
-        return _sides(config)[0]
+            bricks = near.reshape(m, BRICK, m, BRICK, m, BRICK).any(axis=(1, 3, 5))
+            self._begin(Bricks.where(bricks))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Which voxels there are, for a run to go on with."""
@@ -175,6 +178,30 @@ class RadianceVolume:
         (values,) = self._resampled(position, {"radiance": 3})
         return np.maximum(values.numpy().reshape(-1, 3), 0)
 
+    def opacity_at(self, points: mi.Point3f, length: float) -> mi.Float:
+        """Opacity of a way of some ``length`` (of the cube [-1, 1]^3) through what is at world positions; 0
+        where there are no voxels."""
+        voxels = dr.opaque(mi.Float, 0.5 * length * self.bricks.side)
+        density, opacity = dr.detach(self.optimizers["volume"]["density"]), mi.Float(0)
+        for voxel, weight in self.bricks.lookup().around(self.to_lattice @ points, mi.Bool(True)):
+            opacity += weight * (1 - dr.exp(-voxels * softplus(dr.gather(mi.Float, density, voxel))))
+        return opacity
+
+    def views_seeing(self, points: mi.Point3f) -> mi.UInt32:
+        """How many views more than half of the light of world positions reaches."""
+        packets, start, count = self._packets(), self.to_lattice @ points, dr.width(points)
+        seeing = dr.zeros(mi.UInt32, count)
+        for view in range(len(self.views)):
+            film, along = self.views.project(view, points)
+            framed = (along > 0) & dr.all((film >= 0) & (film <= 1))
+            way = self.to_lattice @ mi.Point3f(self.views.origins[view]) - start
+            rays = Rays.through(self.bricks, mi.Ray3f(start, way))
+            rays = replace(rays, last=dr.select(framed, dr.minimum(rays.last, dr.norm(way)), -1))
+            blocked = depth_along(self.bricks, packets, rays) < dr.inf
+            seeing += dr.select(framed & ~blocked, mi.UInt32(1), 0)
+            dr.eval(seeing)
+        return seeing
+
     # --- levels
 
     def _begin(self, bricks: Bricks, values: dict[str, mi.Float] | None = None) -> None:
@@ -183,10 +210,9 @@ class RadianceVolume:
         density = dr.full(mi.Float, inverse_softplus(_FOG), count) if values is None else values["density"]
         to_hull = self._hull.eval(mi.Point3f(0.5 * (bricks.centres() + 1)))[0]
         outside = to_hull > dr.opaque(mi.Float, self._reach)
-        values = values or {
-            "radiance": dr.full(mi.Float, self.mean_radiance, 3 * count),
-            "direction": dr.zeros(mi.Float, 9 * count),
-        }
+        values = values or {"radiance": dr.full(mi.Float, self.mean_radiance, 3 * count)}
+        if self._directional and "direction" not in values:
+            values["direction"] = dr.zeros(mi.Float, 9 * count)
         self.optimizers["volume"] = mi.ad.Adam(
             lr=1.0, beta_2=0.99, params=values | {"density": dr.select(outside, _EMPTY, density)}
         )
@@ -199,7 +225,7 @@ class RadianceVolume:
         m = side // BRICK
         size = len(live) // m
         bricks = Bricks.where(live.reshape(m, size, m, size, m, size).any(axis=(1, 3, 5)))
-        channels = {"density": 1, "radiance": 3, "direction": 9}
+        channels = {name: _CHANNELS[name] for name in self.optimizers["volume"].keys()}
         values = dict(zip(channels, self._resampled(bricks.centres(), channels), strict=True))
         # A voxel of half the length has half the optical depth; but what is opaque stays so.
         values["density"] = dr.clip(values["density"], *_LOGITS)
@@ -248,11 +274,21 @@ class RadianceVolume:
         ray = self.to_lattice @ self.views.rays(sample.view, sample.film)
         return Rays.through(self.bricks, ray, jitter=self._seed_of(step)), sample.radiance, sample.alpha
 
+    @property
+    def _directional(self) -> bool:
+        """Whether radiance depends on the direction. A first level would take a bridge for gloss."""
+        return self.level > 0 and self.config.direction_lr > 0
+
+    @property
+    def _width(self) -> int:
+        """Packets of four numbers per voxel."""
+        return 4 if self._directional else 1
+
     def _packets(self) -> mi.Float:
         """What rays read: per voxel four numbers, radiance and optical depth, or 16 with the slopes of the
         radiance along x, y and z. One voxel is one line of the cache."""
         optimizer, voxel = self.optimizers["volume"], dr.arange(mi.UInt32, self.bricks.voxel_count)
-        width = 4 if self.level else 1
+        width = self._width
         packets = dr.empty(mi.Float, 4 * width * self.bricks.voxel_count)
         red, green, blue = dr.unravel(mi.Vector3f, dr.detach(optimizer["radiance"]))
         depth = softplus(dr.detach(optimizer["density"]))
@@ -271,34 +307,36 @@ class RadianceVolume:
     def _descend(self, gradient: mi.Float, iteration: int) -> None:
         """One step of Adam along the derivative by the packets."""
         config, optimizer, count = self.config, self.optimizers["volume"], self.bricks.voxel_count
-        voxel, width = dr.arange(mi.UInt32, count), 4 if self.level else 1
+        voxel, width = dr.arange(mi.UInt32, count), self._width
         first = dr.gather(mi.Vector4f, gradient, width * voxel)
         dr.set_grad(optimizer["density"], sigmoid(dr.detach(optimizer["density"])) * first.w)
         dr.set_grad(optimizer["radiance"], dr.ravel(mi.Vector3f(first.x, first.y, first.z)))
-        slopes = dr.zeros(mi.Float, 9 * count)
+        slopes = dr.empty(mi.Float, 9 * count)
         for axis in range(width - 1):
             slope = dr.gather(mi.Vector4f, gradient, width * voxel + (axis + 1))
             dr.scatter(
                 slopes, mi.Vector3f(slope.x, slope.y, slope.z), 3 * voxel + axis, mode=dr.ReduceMode.Permute
             )
-        dr.set_grad(optimizer["direction"], slopes)
         begin, end = self._begins[self.level : self.level + 2]
         last = self.level == len(self._sides) - 1
         decay = (0.1 if last else 0.5) ** ((iteration - begin) / max(end - begin, 1))
         bright = decay * self.mean_radiance
-        optimizer.set_learning_rate(
-            {
-                "density": decay * config.density_lr,
-                "radiance": bright * config.radiance_lr,
-                "direction": bright * config.direction_lr if self.level else 0.0,
-            }
-        )
+        rates = {"density": decay * config.density_lr, "radiance": bright * config.radiance_lr}
+        if self._directional:
+            dr.set_grad(optimizer["direction"], slopes)
+            rates["direction"] = bright * config.direction_lr
+        optimizer.set_learning_rate(rates)
         optimizer.step()
-        if self.level:
+        if self._directional:
             kept = dr.opaque(mi.Float, 1 - _DIRECTION_DECAY)
             optimizer["direction"] = kept * dr.detach(optimizer["direction"])
 
 
-def _sides(config: VolumeConfig) -> list[int]:
-    """Voxels per side of each level, in whole bricks."""
-    return [max(BRICK, round(share * config.side / BRICK) * BRICK) for share in _SIDES]
+def sides_of_levels(last: int, count: int) -> list[int]:
+    """Voxels per side of so many levels: whole bricks, then twice as many each, up to ``last`` at least.
+
+    >>> sides_of_levels(256, 3), sides_of_levels(50, 2)
+    ([64, 128, 256], [28, 56])
+    """
+    first = BRICK * math.ceil(last / 2 ** (count - 1) / BRICK)
+    return [first << level for level in range(count)]

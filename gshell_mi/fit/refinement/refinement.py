@@ -25,7 +25,7 @@ from ...schedules import falling
 from ...template.outlines import Outlines
 from ...triangles import face_areas
 from ..bookkeeping.observer import Preview
-from ..radiance.layers import Sheet
+from ..radiance.layers import Layer
 from ..radiance.surface_radiance import SurfaceRadiance
 
 if TYPE_CHECKING:
@@ -81,8 +81,8 @@ class PhotometricRefinement:
         progress = iteration / config.iterations
         positions = optimizer["positions"]
         appearance.move(dr.detach(positions))
-        sample, sheets = appearance.look(iteration)
-        attached = [replace(sheet, weights=_barycentric(positions, sheet)) for sheet in sheets]
+        sample, layers = appearance.look(iteration)
+        attached = [replace(layer, weights=_barycentric(positions, layer)) for layer in layers]
         radiance, _ = appearance.composite(attached, dr.width(sample.view))
         share = appearance.pixels.share
         image = share * losses.log_l1(radiance, sample.radiance)
@@ -120,15 +120,15 @@ class PhotometricRefinement:
         optimizer.step()
 
 
-def _barycentric(positions: mi.Float, sheet: Sheet) -> mi.Vector3f:
+def _barycentric(positions: mi.Float, layer: Layer) -> mi.Vector3f:
     """The weights of the rays' hits, attached to the triangles' vertices (Möller and Trumbore 1997)."""
-    a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in sheet.face)
-    ab, ac, to_origin = b - a, c - a, sheet.origin - a
-    across = dr.cross(sheet.direction, ac)
+    a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in layer.face)
+    ab, ac, to_origin = b - a, c - a, layer.origin - a
+    across = dr.cross(layer.direction, ac)
     determinant = dr.dot(ab, across)
     usable = dr.abs(dr.detach(determinant)) > 1e-12
     scale = dr.rcp(dr.select(usable, determinant, 1))
     u = dr.select(usable, dr.dot(to_origin, across) * scale, 0)
-    v = dr.select(usable, dr.dot(sheet.direction, dr.cross(to_origin, ab)) * scale, 0)
-    u, v = dr.replace_grad(sheet.weights.y, u), dr.replace_grad(sheet.weights.z, v)
+    v = dr.select(usable, dr.dot(layer.direction, dr.cross(to_origin, ab)) * scale, 0)
+    u, v = dr.replace_grad(layer.weights.y, u), dr.replace_grad(layer.weights.z, v)
     return mi.Vector3f(1 - u - v, u, v)

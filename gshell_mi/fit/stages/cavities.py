@@ -7,31 +7,34 @@ inside the hull: a fog of density and radiance shows it, and a minimum cut carve
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
 
-from ..bounds import Between
+import numpy as np
+from scipy import ndimage
+
 from ..carving.carving import carve
-from ..carving.density_grid import DensityGrid
 from ..carving.vessels import hollowed_vessels
+from ..radiance.config import TrainingConfig
+from ..radiance.volume import RadianceVolume, sides_of_levels
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface
 from ..template import closed_template
 
+#: A level twice as coarse as these has voxels thicker than a wall; what is opaque there hardly thins out.
+_LEVELS = 2
+
 
 @dataclass(frozen=True)
-class CavitiesConfig:
-    """Folds and hollows that the hull bridges."""
+class CavitiesConfig(TrainingConfig):
+    """Folds and hollows that the hull bridges, by a radiance volume as fine as the lattice."""
 
     iterations: int = 1000
-    """Steps of the fog; 0 carves nothing. Walls behind openings are tried all the same."""
-    batch: Annotated[int, Between(1)] = 65536
-    """Pixels per step over all views, of which those far from the masks are left out."""
-    lr: float = 0.6
-    """Adam's step for the density's logits; halves over the coarse steps, then falls tenfold."""
-    radiance_lr: float = 0.05
-    """Adam's step for the radiance, as a fraction of the targets' mean."""
+    """Steps of the volume; 0 carves nothing. Walls behind openings are tried all the same."""
+    direction_lr: float = 0.0
+    """Adam's step for what depends on the direction; 0: nothing does, or the fog of a bridge could show every
+    view what it wants to see, and stay."""
 
 
 class Cavities:
@@ -53,20 +56,46 @@ class Cavities:
             steps.fact("vessel", hollowed is not None)
             surface = hollowed or surface
         if cubes and count:
-            _, vertices, faces = closed_template(fit.scene.subject, surface.hull, lattice)
-            volume = DensityGrid(
-                surface.hull.reshape((lattice.stride,) * 3),
-                vertices,
-                faces,
-                fit.scene.subject.to_world,
-                fit.views,
-                fit.training,
-                self.config,
-                steps.done,
-                seed=fit.config.seed,
-            )
-            steps.run(volume, count, volume.optimizers, surface=surface)
+            volume = volume_inside(surface, fit, self.config, steps.kept)
+            steps.run(volume, count, volume.optimizers, volume.arrays, surface=surface)
             with steps.task("cut"):
                 carved = carve(fit, surface, volume)
         steps.fact("carved", carved is not None)
         return carved or surface
+
+
+def volume_inside(
+    surface: Surface, fit: Fit, config: TrainingConfig, kept: Mapping[str, np.ndarray]
+) -> RadianceVolume:
+    """A radiance volume inside a surface's hull, as fine as its lattice, of the training views.
+
+    Args:
+        surface: with its hull, on a lattice whose vertices make a cube.
+        fit: the views.
+        config: how it is trained.
+        kept: ``RadianceVolume.arrays`` of one to go on with, or nothing.
+    """
+    subject, lattice = fit.scene.subject, surface.lattice
+    sides = sides_of_levels(lattice.stride - 1, _LEVELS)
+    # From vertices to the centres of voxels.
+    step = (lattice.stride - 1) / sides[0]
+    hull = ndimage.affine_transform(
+        surface.hull.reshape((lattice.stride,) * 3),
+        step * np.eye(3),
+        0.5 * step,
+        (sides[0],) * 3,
+        order=1,
+        mode="nearest",
+    )
+    _, vertices, faces = closed_template(subject, surface.hull, lattice)
+    return RadianceVolume(
+        hull,
+        subject.to_world,
+        fit.views,
+        fit.training,
+        config,
+        sides,
+        (vertices, faces),
+        kept,
+        seed=fit.config.seed,
+    )

@@ -10,12 +10,15 @@ import trimesh
 
 from ...fields.visual_hull import visual_hull
 from ..radiance.config import VolumeConfig
-from ..radiance.volume import RadianceVolume
+from ..radiance.volume import RadianceVolume, sides_of_levels
 from ..radiance.volume_surface import volume_surface
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface
 from ..unseen import without_unseen_parts
+
+#: From coarse to fine: what all views can tell of first.
+_LEVELS = 3
 
 
 class Volume:
@@ -49,14 +52,23 @@ class Volume:
         self, fit: Fit, surface: tuple[np.ndarray, np.ndarray], kept: Mapping[str, np.ndarray]
     ) -> RadianceVolume:
         """A radiance volume inside the visual hull, or the one that was begun."""
-        side, subject = RadianceVolume.first_side(self.config), fit.scene.subject
+        sides, subject = sides_of_levels(self.config.side, _LEVELS), fit.scene.subject
+        side = sides[0]
         centre = (np.arange(side, dtype=np.float32) + 0.5) * (2 / side) - 1
         z, y, x = (axis.ravel() for axis in np.meshgrid(centre, centre, centre, indexing="ij"))
         points = mi.Transform4f(subject.to_world) @ mi.Point3f(x, y, z)
         hull = visual_hull(points, fit.views, fit.alphas)
         hull = np.clip(hull.numpy() / subject.length_scale, -1, 1).reshape((side,) * 3)
         return RadianceVolume(
-            hull, subject.to_world, fit.views, fit.pixels, self.config, surface, kept, seed=fit.config.seed
+            hull,
+            subject.to_world,
+            fit.views,
+            fit.pixels,
+            self.config,
+            sides,
+            surface,
+            kept,
+            seed=fit.config.seed,
         )
 
 

@@ -1,5 +1,7 @@
 """Carving a cup out of the block that is its hull; and leaving a block, or what has other loops, alone."""
 
+from functools import cache
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -8,8 +10,9 @@ from cup import CONFIG, HALF, cup, fit_of, hull_of, solid_block, surface_of
 from scipy.spatial import cKDTree
 
 from gshell_mi.fit.carving import carving
-from gshell_mi.fit.carving.carving import carve
-from gshell_mi.fit.carving.density_grid import DensityGrid
+from gshell_mi.fit.carving.carving import carve, opacity_and_visibility
+from gshell_mi.fit.stages.cavities import volume_inside
+from gshell_mi.fit.surface import Surface
 from gshell_mi.fit.template import template_of
 from gshell_mi.lattice import make_lattice
 
@@ -19,26 +22,47 @@ LATTICE = make_lattice("tet", RESOLUTION)
 
 
 @pytest.fixture(scope="module")
-def trained():
+def subject() -> mi.Shape:
+    return mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
+
+
+@pytest.fixture(scope="module")
+def before() -> Surface:
+    hull, _, _ = hull_of(RESOLUTION)
+    return surface_of(hull, np.ones_like(hull))
+
+
+@pytest.fixture(scope="module")
+def volumes(subject, before):
+    """A function that trains a volume on views of a shape; returns a fit and the volume."""
+
+    @cache
+    def trained(shape):
+        fit = fit_of(subject, shape())
+        volume = volume_inside(before, fit, CONFIG.cavities, {})
+        for step in range(CONFIG.cavities.iterations):
+            volume.step(step)
+        return fit, volume
+
+    return trained
+
+
+@pytest.fixture(scope="module")
+def trained(subject, before, volumes):
     """A function that carves the hull of a shape."""
-    subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
-    hull, vertices, faces = hull_of(RESOLUTION)
-    before = surface_of(hull, np.ones_like(hull))
-    volumes = {}
 
     def run(shape, **fields):
-        if shape not in volumes:
-            fit = fit_of(subject, shape())
-            volume = DensityGrid(
-                hull, vertices, faces, subject.to_world, fit.views, fit.training, CONFIG.cavities
-            )
-            for step in range(CONFIG.cavities.iterations):
-                volume.step(step)
-            volumes[shape] = fit, volume
-        fit, volume = volumes[shape]
+        fit, volume = volumes(shape)
         return subject, before, carve(fit, before.with_fields(**fields), volume)
 
     return run
+
+
+def test_the_volume_thins_in_the_cup_and_not_in_its_walls(subject, before, volumes):
+    opacity, seen = opacity_and_visibility(volumes(cup)[1], before, subject.to_world)
+    within, bottom, deep, outside = (16, 21, 16), (16, 15, 16), (16, 10, 16), (1, 1, 1)
+    assert opacity[within] < 0.2 < 0.5 < opacity[bottom]
+    assert seen[within] and seen[outside] and not seen[deep]
 
 
 def test_a_cup_is_found(trained):

@@ -96,7 +96,7 @@ def test_what_no_ray_meets_keeps_its_radiance():
     np.testing.assert_array_equal(appearance.radiance(), before)
 
 
-def test_only_the_first_sheets_count():
+def test_only_the_first_layers_count():
     appearance = SurfaceRadiance(*two_sheets(), *unused_views(), dataclasses.replace(CONFIG, layers=1))
     _, alpha = composite(appearance, [0.1, 0.2, 5], [0, 0, -1])
     assert alpha == pytest.approx(0.35, abs=1e-5), "where every vertex starts"

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from bowl import RADIUS
 from gshell_mi.fields.visual_hull import visual_hull
 from gshell_mi.fit.bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
 from gshell_mi.fit.radiance.config import VolumeConfig
-from gshell_mi.fit.radiance.volume import RadianceVolume
+from gshell_mi.fit.radiance.volume import RadianceVolume, sides_of_levels
 from gshell_mi.fit.radiance.volume_surface import volume_surface
 from gshell_mi.lattice import make_lattice
 from gshell_mi.pixels import PixelPool
@@ -28,7 +29,8 @@ def scene(bowl_scene) -> FitScene:
 
 def _volume(scene: FitScene, config: VolumeConfig = CONFIG, stored=None) -> RadianceVolume:
     views = PinholeViews.from_sensors(scene.sensors)
-    side = RadianceVolume.first_side(config)
+    sides = sides_of_levels(config.side, 3)
+    side = sides[0]
     centre = (np.arange(side, dtype=np.float32) + 0.5) * (2 / side) - 1
     z, y, x = (axis.ravel() for axis in np.meshgrid(centre, centre, centre, indexing="ij"))
     alphas = [target.rgba[..., 3] for target in scene.targets]
@@ -40,6 +42,7 @@ def _volume(scene: FitScene, config: VolumeConfig = CONFIG, stored=None) -> Radi
         views,
         PixelPool(views, scene.targets),
         config,
+        sides,
         surface,
         stored,
     )
@@ -71,6 +74,22 @@ def test_its_depth_is_that_of_the_bowl(scene, trained):
     assert np.median(np.concatenate(errors)) < 1.5 * 2 / CONFIG.side
 
 
+def test_nothing_is_seen_from_within_what_is_opaque(scene):
+    volume = _volume(scene)
+    count = volume.bricks.voxel_count
+    volume.optimizers["volume"]["density"] = dr.full(mi.Float, 100, count)
+    inside, outside = mi.Point3f(0, -0.3, 0), mi.Point3f(0, 0.95, 0)
+    assert volume.views_seeing(inside)[0] == 0 and volume.opacity_at(inside, 0.1)[0] == pytest.approx(1)
+    assert volume.views_seeing(outside)[0] > 0 and volume.opacity_at(outside, 0.1)[0] == 0
+
+
+def test_opacity_is_that_of_a_length(scene):
+    volume = _volume(scene)
+    assert -np.log1p(-volume.opacity_at(mi.Point3f(0, -0.3, 0), 0.1)[0]) == pytest.approx(
+        0.13 * 0.1 * volume.bricks.side / 2, rel=1e-3
+    )
+
+
 def test_its_surface_is_around_the_bowl(scene, trained):
     """Wide enough for the lattice, and no wider; what it shows is what is seen there."""
     lattice = make_lattice("cube", 32)
@@ -82,8 +101,9 @@ def test_its_surface_is_around_the_bowl(scene, trained):
     assert found.seen.known.any() and found.seen.radiance[found.seen.known].max() > 0.05
 
 
-def test_it_goes_on_where_it_stopped(scene):
-    config = dataclasses.replace(CONFIG, iterations=20)
+@pytest.mark.parametrize("direction_lr", [0.03, 0.0])
+def test_it_goes_on_where_it_stopped(scene, direction_lr):
+    config = dataclasses.replace(CONFIG, iterations=20, direction_lr=direction_lr)
     whole, first = _volume(scene, config), _volume(scene, config)
     for iteration in range(20):
         whole.step(iteration)
@@ -96,6 +116,7 @@ def test_it_goes_on_where_it_stopped(scene):
     for iteration in range(14, 20):
         second.step(iteration)
     assert (second.bricks.places == whole.bricks.places).all()
-    for name in ("density", "radiance", "direction"):
+    assert ("direction" in whole.optimizers["volume"].keys()) == (direction_lr > 0)
+    for name in whole.optimizers["volume"].keys():
         one, other = (volume.optimizers["volume"][name].numpy() for volume in (whole, second))
         assert np.median(np.abs(one - other)) < 1e-3 * np.abs(one).max()

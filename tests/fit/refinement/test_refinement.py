@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from gshell_mi.fit.judge import Judge
-from gshell_mi.fit.radiance.layers import Sheet
+from gshell_mi.fit.radiance.layers import Layer
 from gshell_mi.fit.radiance.surface_radiance import RadianceConfig, SurfaceRadiance
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement, _barycentric
 from gshell_mi.fit.stages.refinement import RefinementConfig
@@ -160,7 +160,7 @@ def test_outline_loss_derivative_is_that_of_a_scaled_sphere(capture):
 
 def test_attached_barycentrics():
     positions = mi.Float([0, 0, 0, 1, 0, 0, 0, 1, 0])
-    hit = Sheet(
+    hit = Layer(
         mi.UInt32(0),
         mi.Point3f(0.25, 0.5, 1),
         mi.Vector3f(0, 0, -1),
