@@ -87,3 +87,15 @@ def template_of(subject: mi.Shape, surface: Surface, *, like: Template | None = 
         logits = np.where(near, like.logits[nearest], CERTAIN)
     start = back_on_solid(vertices, faces, np.where(logits > 0, subject.length_scale * excess, 0))
     return Template(mesh, vertices, faces, logits, start)
+
+
+def lattice_index(points: np.ndarray, to_world: mi.ScalarTransform4f, side: int) -> np.ndarray:
+    """Where world positions are in an array of a lattice's vertices: (3, V), z, y and x, with fractions.
+
+    Args:
+        points: (V, 3) world positions.
+        to_world: from the cube [-1, 1]^3 of the lattice.
+        side: cells per side.
+    """
+    local = mi.Transform4f(to_world).inverse() @ mi.Point3f(np.ascontiguousarray(points.T, np.float32))
+    return ((local + 1) * (0.5 * side)).numpy()[::-1]

@@ -17,7 +17,7 @@ from ..radiance.on_template import fitted_radiance
 from ..radiance.volume import RadianceVolume
 from ..stage import Fit
 from ..surface import Seen, Surface
-from ..template import Template, template_of
+from ..template import Template, lattice_index, template_of
 from .hollows import hollowed, hollows
 
 #: Space is empty below this opacity of a cell.
@@ -107,19 +107,11 @@ def opacity_and_visibility(
     return opacity.reshape(shape), seen.reshape(shape)
 
 
-def _on_lattice(template: Template, to_world: mi.ScalarTransform4f, side: int) -> np.ndarray:
-    """(3, V) indices z, y, x of vertices in a cube of ``side`` cells, with fractions."""
-    local = mi.Transform4f(to_world).inverse() @ mi.Point3f(
-        np.ascontiguousarray(template.vertices.T, np.float32)
-    )
-    return ((local + 1) * (0.5 * side)).numpy()[::-1]
-
-
 def _in_empty_space(
     template: Template, to_world: mi.ScalarTransform4f, opacity: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
     """(V,) whether there is nothing within a cell of a vertex, and it is seen."""
-    index = _on_lattice(template, to_world, len(opacity) - 1)
+    index = lattice_index(template.vertices, to_world, len(opacity) - 1)
     around = ndimage.gaussian_filter(opacity, 1.0)
     return (ndimage.map_coordinates(around, index, order=1) < _EMPTY) & ndimage.map_coordinates(
         seen, index, order=0
@@ -128,7 +120,7 @@ def _in_empty_space(
 
 def _kept(fit: Fit, before: Template, after: Template, label: np.ndarray) -> np.ndarray:
     """(count,) which hollows explain unseen views better, by the rays that enter them."""
-    index = np.rint(_on_lattice(before, fit.scene.subject.to_world, len(label) - 1)).astype(int)
+    index = np.rint(lattice_index(before.vertices, fit.scene.subject.to_world, len(label) - 1)).astype(int)
     place = label[tuple(np.clip(index, 0, len(label) - 1))] - 1
     verdict = fit.judge.compare(
         fit.judge.shown(before.surface).whole,

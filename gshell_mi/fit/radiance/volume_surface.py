@@ -75,7 +75,7 @@ def volume_surface(
         mi.Point3f(points.numpy()[:, near]), views, depths, truncation=_TRUNCATION * cell, share=_VOTES
     )
     distance[near] = np.maximum(distance[near], inside.numpy())
-    outside = _without_specks((distance / cell).reshape((lattice.stride,) * 3), margin) - margin
+    outside = without_specks((distance / cell).reshape((lattice.stride,) * 3), margin) - margin
     sdf = closed_at_border(lattice.spacing * outside.ravel(), lattice)
     if not (sdf < 0).any():
         return None
@@ -86,7 +86,7 @@ def volume_surface(
     return Surface(LatticeFields.closed(sdf, lattice.grid), seen=seen)
 
 
-def _without_specks(distance: np.ndarray, level: float) -> np.ndarray:
+def without_specks(distance: np.ndarray, level: float) -> np.ndarray:
     """Distances without the small floaters below a level, and without air that nothing leads to."""
     everywhere = np.ones((3, 3, 3))
     label, _ = ndimage.label(distance < level, everywhere)

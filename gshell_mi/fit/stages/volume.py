@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import mitsuba as mi
 import numpy as np
-import trimesh
 
 from ...fields.visual_hull import visual_hull
 from ..radiance.config import VolumeConfig
+from ..radiance.merging import merged
 from ..radiance.volume import RadianceVolume, sides_of_levels
 from ..radiance.volume_surface import volume_surface
 from ..runner import Steps
@@ -40,13 +40,10 @@ class Volume:
         if other is None:
             return surface
         with steps.task("verdict"):
-            # Its radiance may be as fine as that of the other.
-            after = subject.surface_of(other.fields).to_numpy()[:2]
-            before = _as_fine(before, fit.cell(other))
-            verdict = fit.judge.decide(before, after)
-        steps.fact("volume", verdict.facts())
-        steps.fact("volume_kept", bool(verdict.accepted[0]))
-        return without_unseen_parts(fit, other) if verdict.accepted[0] else surface
+            found = merged(fit, surface, other)
+        steps.fact("volume", found.facts())
+        steps.fact("volume_kept", found.surface is not None)
+        return surface if found.surface is None else without_unseen_parts(fit, found.surface)
 
     def _volume(
         self, fit: Fit, surface: tuple[np.ndarray, np.ndarray], kept: Mapping[str, np.ndarray]
@@ -70,12 +67,3 @@ class Volume:
             kept,
             seed=fit.config.seed,
         )
-
-
-def _as_fine(surface: tuple[np.ndarray, np.ndarray], length: float) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh whose edges are at most about as long as given."""
-    vertices, faces = surface
-    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
-    if len(faces) and np.median(np.linalg.norm(edges, axis=-1)) > 1.5 * length:
-        return trimesh.remesh.subdivide(vertices, faces)
-    return surface
