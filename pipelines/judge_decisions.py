@@ -145,8 +145,8 @@ def fitted_openings(path: Path, config: FitConfig) -> tuple[list[Change], Surfac
     surface, stage = Surface(scene.subject.fields()), None
 
     class Recording(Judge):
-        def compare(self, before, after, label=None, where=None) -> Verdict:
-            verdict = super().compare(before, after, label, where)
+        def compare(self, before, after, label=None, where=None, *, places=None) -> Verdict:
+            verdict = super().compare(before, after, label, where, places=places)
             # Parts are openings; one split is the refinement's second opinion.
             if before.values is after.values is None and len(self.splits) > 1 and len(after.shown.mesh[1]):
                 changes.append(

@@ -73,6 +73,15 @@ class Verdict:
         accepted[told] = family[: len(accident)] < _ACCIDENTS
         return accepted
 
+    @property
+    def reversed(self) -> Verdict:
+        """On the change taken back."""
+        return Verdict(self.after, self.before, -self.gain, self.noise, self.rejected)
+
+    def at(self, places: slice) -> Verdict:
+        """On some of the places, as if no others had been asked for."""
+        return Verdict(self.before[places], self.after[places], self.gain[places], self.noise[places])
+
     def facts(self) -> dict[str, list[float]]:
         """For ``metrics.json``: gain and noise of each place."""
         return {
@@ -132,7 +141,13 @@ class Judge:
         return Shown(mesh, self.views, self._pools, batch=self.batch, seed=self.seed, like=like)
 
     def compare(
-        self, before: Part, after: Part, label: np.ndarray | None = None, where: Shown | None = None
+        self,
+        before: Part,
+        after: Part,
+        label: np.ndarray | None = None,
+        where: Shown | None = None,
+        *,
+        places: int | None = None,
     ) -> Verdict:
         """Judges a change.
 
@@ -141,8 +156,9 @@ class Judge:
             label: (V,) which change the vertices of a mesh tell of, from 0; -1 where of none. A ray judges
                 the change at the vertex that it meets first. Default: all rays judge one change.
             where: that mesh; default: what ``before`` is a part of.
+            places: how many there are; default: as many as ``label`` names, at least one.
         """
-        places = 1 if label is None else max(int(label.max()) + 1, 1)
+        places = places or (1 if label is None else max(int(label.max()) + 1, 1))
         where, counts = where or before.shown, self._blocks_per_view(before.shown, after.shown)
         sums = [dr.zeros(mi.Float, places * len(self.views)) for _ in range(5)]
         with dr.suspend_grad():

@@ -52,8 +52,8 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
     before = template_of(subject, surface)
     after = template_of(subject, carved, like=before)
     label, _ = ndimage.label(distance > 0, np.ones((3, 3, 3)))
-    label = np.where(label, label, ndimage.maximum_filter(label, size=3))
     # Vertices beside a hollow belong to it.
+    label = np.where(label, label, ndimage.maximum_filter(label, size=3))
     owner = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
     kept = _kept(fit, before, after, label)
     if not kept.any():
@@ -122,12 +122,10 @@ def _kept(fit: Fit, before: Template, after: Template, label: np.ndarray) -> np.
     """(count,) which hollows explain unseen views better, by the rays that enter them."""
     index = np.rint(lattice_index(before.vertices, fit.scene.subject.to_world, len(label) - 1)).astype(int)
     place = label[tuple(np.clip(index, 0, len(label) - 1))] - 1
-    verdict = fit.judge.compare(
+    return fit.judge.compare(
         fit.judge.shown(before.surface).whole,
         fit.judge.shown(after.surface).whole,
         place,
         fit.judge.shown(before.closed),
-    )
-    kept = np.zeros(label.max(), bool)
-    kept[: len(verdict.accepted)] = verdict.accepted[: len(kept)]
-    return kept
+        places=int(label.max()),
+    ).accepted

@@ -33,8 +33,8 @@ class VolumeConfig(TrainingConfig):
     """Radiance volume: another start, for what no hull shows."""
 
     iterations: int = 700
-    """Steps of the radiance volume whose surface the joint stage starts from if it explains unseen views
-    better; 0 leaves it out."""
+    """Steps of the radiance volume; the joint stage starts from what of its surface explains unseen views
+    better. 0 leaves it out."""
     side: Annotated[int, Between(4)] = 256
     """Voxels per side of its last level, rounded up to whole bricks of the first."""
     resolution: Annotated[int, Between(4)] = 128

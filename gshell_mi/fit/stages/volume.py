@@ -1,4 +1,4 @@
-"""Volume: another start than the hull, from a radiance volume; unseen views judge between the two."""
+"""Volume: another start than the hull, from a radiance volume; unseen views judge, place by place."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LEVELS = 3
 
 
 class Volume:
-    """Takes the surface of a radiance volume if that explains unseen views better."""
+    """Takes what a radiance volume shows of the surface where that explains unseen views better."""
 
     name = "volume"
 
@@ -30,8 +30,11 @@ class Volume:
         self.config = config
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
-        """The better one of both surfaces; that of the volume is on a lattice of its own."""
+        """The surface, or one with places of the volume's, on a lattice of its own. Lattices whose vertices
+        make no cube have none."""
         subject, lattice = fit.scene.subject, fit.lattices.volume
+        if lattice.vertex_count != lattice.stride**3:
+            return surface
         before = subject.surface_of(surface.fields).to_numpy()[:2]
         volume = self._volume(fit, before, steps.kept)
         steps.run(volume, self.config.iterations, volume.optimizers, volume.arrays)

@@ -33,16 +33,20 @@ def of(*hollows: np.ndarray, opened: np.ndarray | None = None):
 
 def test_what_is_true_is_taken_and_what_is_not_is_left(fit):
     found = merged(fit, of(), of(HOLLOW, CRATER))
-    assert (found.taken, found.places) == (1, 2) and found.verdict.accepted[0]
+    assert (found.taken, found.places) == (1, 2) and found.whole.accepted[0]
     sdf = found.surface.fields.sdf.reshape(BLOCK.shape)
     centre, quarter = RESOLUTION // 2, round(0.25 / CELL)
     assert sdf[centre, centre + quarter, centre] > 0 > sdf[centre, centre - 2 * quarter, centre]
     assert found.surface.seen.known.any() and found.surface.seen.radiance.max() > 0.1
 
 
-def test_if_all_of_it_is_true_the_other_one_is_taken_as_it_is(fit):
-    other = of(HOLLOW)
-    assert merged(fit, of(), other).surface is other
+def test_openings_elsewhere_stay_if_every_place_is_taken(fit):
+    """Elsewhere the other one is worse: it is closed there."""
+    surfaces = of(opened=np.where(X < -HALF + CELL, -CELL, CELL)), of(HOLLOW)
+    found = merged(SimpleNamespace(**vars(fit) | {"judge": Scripted(fit.judge, [1, -1])}), *surfaces)
+    assert (found.taken, found.places) == (1, 1)
+    sdf, msdf = (values.reshape(X.shape) for values in (found.surface.fields.sdf, found.surface.fields.msdf))
+    assert (msdf[(X < -HALF + 0.5 * CELL) & (abs(sdf) < CELL)] < 0).all()
 
 
 class Scripted:
@@ -51,7 +55,7 @@ class Scripted:
     def __init__(self, judge: Judge, gains: list[float]):
         self.shown, self.gains = judge.shown, np.array(gains, float)
 
-    def compare(self, before, after, label=None, where=None) -> Verdict:
+    def compare(self, before, after, label=None, where=None, places=1) -> Verdict:
         gains = np.ones(1) if label is None else self.gains
         return Verdict(np.ones_like(gains), np.ones_like(gains), gains, np.full_like(gains, 0.1))
 
