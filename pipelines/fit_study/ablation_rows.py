@@ -93,8 +93,12 @@ CHOICES = [
         "Radiance volume",
         ("volume-coarse", "half as many voxels per side", {"volume.side": 128}),
         ("no-volume-direction", "radiance has no direction", {"volume.direction_lr": 0.0}),
-        ("no-volume-mask", "no mask loss", {"volume.mask": 0.0}),
-        ("no-volume-distortion", "rays may see a spread", {"volume.distortion": 0.0}),
+        ("no-volume-mask", "no mask loss", {"volume.mask": 0.0, "cavities.mask": 0.0}),
+        (
+            "no-volume-distortion",
+            "rays may see a spread",
+            {"volume.distortion": 0.0, "cavities.distortion": 0.0},
+        ),
     ),
     *_group(
         "Geometry in the joint stage",
