@@ -311,18 +311,21 @@ class RadianceVolume:
         first = dr.gather(mi.Vector4f, gradient, width * voxel)
         dr.set_grad(optimizer["density"], sigmoid(dr.detach(optimizer["density"])) * first.w)
         dr.set_grad(optimizer["radiance"], dr.ravel(mi.Vector3f(first.x, first.y, first.z)))
-        slopes = dr.empty(mi.Float, 9 * count)
-        for axis in range(width - 1):
-            slope = dr.gather(mi.Vector4f, gradient, width * voxel + (axis + 1))
-            dr.scatter(
-                slopes, mi.Vector3f(slope.x, slope.y, slope.z), 3 * voxel + axis, mode=dr.ReduceMode.Permute
-            )
         begin, end = self._begins[self.level : self.level + 2]
         last = self.level == len(self._sides) - 1
         decay = (0.1 if last else 0.5) ** ((iteration - begin) / max(end - begin, 1))
         bright = decay * self.mean_radiance
         rates = {"density": decay * config.density_lr, "radiance": bright * config.radiance_lr}
         if self._directional:
+            slopes = dr.empty(mi.Float, 9 * count)
+            for axis in range(width - 1):
+                slope = dr.gather(mi.Vector4f, gradient, width * voxel + (axis + 1))
+                dr.scatter(
+                    slopes,
+                    mi.Vector3f(slope.x, slope.y, slope.z),
+                    3 * voxel + axis,
+                    mode=dr.ReduceMode.Permute,
+                )
             dr.set_grad(optimizer["direction"], slopes)
             rates["direction"] = bright * config.direction_lr
         optimizer.set_learning_rate(rates)
