@@ -31,16 +31,17 @@ def block(low, high) -> trimesh.Trimesh:
     return box.apply_translation((low + high) / 2)
 
 
-def cup() -> trimesh.Trimesh:
-    """The upper half is hollow, open towards y = +HALF."""
-    inner = HALF - WALL
+def cup(floor: float = 0.0, wall: float = WALL) -> trimesh.Trimesh:
+    """Hollow above y = floor, half of it by default; open towards y = +HALF."""
+    inner = HALF - wall
     walls = [
-        ([-HALF, 0, -HALF], [-inner, HALF, HALF]),
-        ([inner, 0, -HALF], [HALF, HALF, HALF]),
-        ([-HALF, 0, -HALF], [HALF, HALF, -inner]),
-        ([-HALF, 0, inner], [HALF, HALF, HALF]),
+        ([-HALF, floor, -HALF], [-inner, HALF, HALF]),
+        ([inner, floor, -HALF], [HALF, HALF, HALF]),
+        ([-HALF, floor, -HALF], [HALF, HALF, -inner]),
+        ([-HALF, floor, inner], [HALF, HALF, HALF]),
     ]
-    return trimesh.util.concatenate([block([-HALF] * 3, [HALF, 0, HALF]), *(block(*ends) for ends in walls)])
+    bottom = block([-HALF] * 3, [HALF, floor, HALF])
+    return trimesh.util.concatenate([bottom, *(block(*ends) for ends in walls)])
 
 
 def solid_block() -> trimesh.Trimesh:

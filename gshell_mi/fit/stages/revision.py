@@ -4,7 +4,7 @@ They are first sought on a hull, before anything is known of exposures, cameras 
 that is wrong, what is seen through a true opening is explained no better than by its cap, and a false one
 may be right behind the surface. So the same radiance with opacity, and the same judge, are asked once more.
 An opening that explains unseen views no better than a cap does closes; what is proposed and explains them
-better, also than a dent would, opens; what nobody tells of stays as it is.
+better opens, or becomes a recess if that explains them as well; what nobody tells of stays as it is.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...fields.smoothing import MeshDiffusion
-from ...template.caps import dented, least_bent, put_in_place
+from ...template.caps import Recesses, least_bent, put_in_place
 from ...template.msdf import clean_opacity, reopened, rewritten
 from ...template.sides import opposite_sides
 from ...topology import inner, lobes
@@ -79,20 +79,23 @@ class Revision:
             moved = np.where(capped[:, None], smooth, vertices)
             shown = fit.judge.shown((moved, faces), like=now)
             revised = _with_islands(fit.judge, shown, revised, proposed)
-            revised = _opened(fit, shown, revised, proposed, thin)
+            revised, recessed = _opened(fit, shown, revised, proposed, thin, cell)
+            deeper = (recessed != moved).any(axis=1)
             revised = clean_opacity(revised, moved, faces, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
         steps.fact("openings_changed", bool(changed.any()))
-        if not changed.any():
+        steps.fact("recessed_vertices", int(deeper.sum()))
+        if not (changed | deeper).any():
             return surface
         smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
         cut, near = reopened(lattice.spacing * values, revised <= 0, smooth, lattice.spacing)
         msdf = rewritten(mi.Float(fields.msdf), cut, near, template, lattice).numpy()
-        capped &= revised > 0
-        if not capped.any():
+        elsewhere = (capped | deeper) & (revised > 0)
+        if not elsewhere.any():
             return replace(surface.with_fields(msdf=msdf), settled=False)
         points = mi.Transform4f(fit.scene.subject.to_world) @ mi.Point3f(lattice.points(mi.Float))
-        sdf, told = put_in_place(fields.sdf / lattice.spacing, points.numpy().T, moved, faces, capped, cell)
+        moved = np.where(elsewhere[:, None], recessed, vertices)
+        sdf, told = put_in_place(fields.sdf / lattice.spacing, points.numpy().T, vertices, moved, faces, cell)
         sdf = (lattice.spacing * sdf).astype(np.float32)
         msdf = np.where(told, np.maximum(np.abs(msdf), SURE * lattice.spacing), msdf).astype(np.float32)
         return replace(surface.with_fields(sdf=sdf, msdf=msdf), settled=False)
@@ -151,9 +154,9 @@ def _with_islands(judge: Judge, template: Shown, values: np.ndarray, proposed: n
 
 
 def _opened(
-    fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray, thin: np.ndarray
-) -> np.ndarray:
-    """(V,) values, negative also where unseen views are explained better without the surface.
+    fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray, thin: np.ndarray, cell: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Opens, or moves deeper, what explains unseen views better so.
 
     Args:
         fit: the views.
@@ -161,6 +164,10 @@ def _opened(
         values: (V,) negative at its openings.
         proposed: (V,) opacity logits.
         thin: (V,) where the template's other side is within two cells.
+        cell: side of a lattice cell, world units.
+
+    Returns:
+        (V,) values, negative also at new openings; (V, 3) vertices of the template, those of recesses moved.
     """
     vertices, faces = template.mesh
     given, now = values <= 0, template.part(values)
@@ -176,10 +183,48 @@ def _opened(
     )
     opened = (values <= 0) & ~given
     if not opened.any():
-        return values
-    # Where the surface fills a recess, whatever lies deeper explains more than it does.
+        return values, vertices
     place = places_of(opened, lobes(opened, faces))
-    dents = fit.judge.shown((dented(vertices, faces, place), faces), like=template)
-    holes = template.part(values)
-    deeper = fit.judge.compare(dents.part(np.where(given, values, 1.0)), holes, place, template)
-    return np.where(opened & ~(deeper.gain > 0)[place], -values, values)
+    recesses = Recesses(vertices, faces, place)
+    depth, least = _recessed(
+        fit.judge, template, recesses, np.where(opened, -values, values), values, place, cell
+    )
+    values = np.where(opened & ~(least > 0)[place], -values, values)
+    return values, recesses.at(np.where(least > 0, 0, depth))
+
+
+def _recessed(
+    judge: Judge,
+    template: Shown,
+    recesses: Recesses,
+    closed: np.ndarray,
+    opened: np.ndarray,
+    place: np.ndarray,
+    cell: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Recesses at the places of new openings: what lies behind a surface need not be nothing.
+
+    Where the surface fills a recess, whatever lies deeper explains more than it does, and a hole is deep.
+
+    Args:
+        judge: of the fit.
+        template: closed.
+        recesses: of it.
+        closed, opened: (V,) values, negative at openings, without and with the new ones.
+        place: (V,) of the new openings, P places, -1 elsewhere.
+        cell: side of a lattice cell, world units.
+
+    Returns:
+        (P,) depth of the recess that explains unseen views best, 0 where none does surely better than the
+        surface; (P,) by how much at least an opening explains them better than a recess does.
+    """
+    now, holes = template.part(closed), template.part(opened)
+    best, depth, least = np.zeros((3, len(recesses.width)))
+    least += np.inf
+    for deep in recesses.depths(cell):
+        recess = judge.shown((recesses.at(deep), template.mesh[1]), like=template).part(closed)
+        least = np.minimum(least, judge.compare(recess, holes, place, template).gain)
+        verdict = judge.compare(now, recess, place, template)
+        better = verdict.accepted & (verdict.gain > best)
+        best, depth = np.where(better, verdict.gain, best), np.where(better, deep, depth)
+    return depth, least

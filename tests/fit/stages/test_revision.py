@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 import trimesh
 from cap import cap
+from cup import HALF, WALL, capture, cup, solid_block
 from scripted_judge import ScriptedJudge
 from silent_steps import Silent
 
 from gshell_mi.fit.judge import Judge
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.hull import Hull
-from gshell_mi.fit.stages.revision import Revision, _closed
+from gshell_mi.fit.stages.revision import Revision, _closed, _recessed
+from gshell_mi.template.caps import Recesses
 from gshell_mi.topology import inner, topology
 
 #: Fewer steps and pixels, as so small images need.
@@ -132,17 +134,39 @@ def vertices_of(fit, surface):
     return fit.scene.subject.surface_of(surface.fields).to_numpy()[0]
 
 
-def test_what_a_dent_explains_as_well_does_not_open(fit, hull, monkeypatch):
-    """The lid, if a dent in it were as good as what is seen through it."""
-    given, asked = Judge.compare, []
+@pytest.mark.parametrize(("floor", "wall"), [(0.0, WALL), (-0.57, 0.03)])
+def test_what_lies_half_way_is_a_recess_and_what_lies_behind_is_seen_through_an_opening(floor, wall):
+    """A block that is a cup in truth, whose floor is in its middle, or its bottom."""
+    views, _, targets = capture(cup(floor, wall))
+    judge = Judge(views, targets, Judge.halves(len(views)), batch=16384)
+    side = 0.06
+    vertices, faces = trimesh.remesh.subdivide_to_size(solid_block().vertices, solid_block().faces, side)
+    lid = (vertices[:, 1] > HALF - 1e-6) & (np.abs(vertices[:, [0, 2]]) < HALF - wall).all(axis=1)
+    place, closed = np.where(lid, 0, -1), np.ones(len(vertices))
+    recesses = Recesses(vertices, faces, place)
+    depth, least = _recessed(
+        judge, judge.shown((vertices, faces)), recesses, closed, np.where(lid, -1, closed), place, side
+    )
+    if floor == 0:
+        assert recesses.at(depth)[lid, 1].min() == pytest.approx(floor, abs=0.15) and least[0] < 0
+    else:
+        assert least[0] > 0
+
+
+@pytest.mark.parametrize("recess", [False, True])
+def test_what_a_recess_explains_as_well_does_not_open(fit, hull, monkeypatch, recess):
+    """The lid, if a recess in it were as good as what is seen through it, and better than the lid, or not."""
+    given = Judge.compare
 
     def compare(self, before, after, label=None, where=None):
         verdict = given(self, before, after, label, where)
-        if before.shown is after.shown or where is not after.shown:
+        if before.shown is after.shown:
             return verdict
-        asked.append(float(verdict.gain[0]))
-        return replace(verdict, gain=-np.abs(verdict.gain))
+        better = np.abs(verdict.gain) + 3 * verdict.noise
+        return replace(verdict, gain=better if recess and where is before.shown else -better)
 
     monkeypatch.setattr(Judge, "compare", compare)
-    _, changed = revised(fit, hull)
-    assert not changed and len(asked) == 1 and asked[0] > 0
+    found, changed = revised(fit, hull)
+    assert not changed and loops(fit, found).boundary_loops == 0
+    before, after = (vertices_of(fit, surface)[:, 1].max() for surface in (hull, found))
+    assert after == before if not recess else not found.settled and after < before
