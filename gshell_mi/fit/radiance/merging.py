@@ -72,37 +72,68 @@ def merged(fit: Fit, surface: Surface, other: Surface) -> Merged:
     lattice, subject, length = other.lattice, fit.scene.subject, fit.cell(other)
     fields = surface.fields.to_lattice(lattice.resolution, lattice.grid)
     fields = transfer_msdf(subject, surface.fields, fields)
-    shape = (lattice.stride,) * 3
-    inside, there = (_inside(values.reshape(shape)) for values in (fields.sdf, other.fields.sdf))
-    differs = ((inside > 0) != (there > 0)) & (np.minimum(abs(inside), abs(there)) > _DEEP)
-    label, count = ndimage.label(differs, np.ones((3, 3, 3)))
-    away, nearest = ndimage.distance_transform_edt(label == 0, return_indices=True)
-    owner = label[tuple(nearest)] - 1 if count else np.zeros(shape, int)
-    beside = (away <= _BESIDE) & (count > 0)
+    places = _Places.between(fields, other.fields)
     closed = _as_fine(subject.surface_of(surface.fields, template=True).to_numpy()[:2], length)
-    index = np.rint(lattice_index(closed[0], subject.to_world, lattice.stride - 1)).astype(int)
-    at = tuple(np.clip(index, 0, lattice.stride - 1))
     now = fit.judge.shown(_as_fine(subject.surface_of(surface.fields).to_numpy()[:2], length))
     then = fit.judge.shown(subject.surface_of(other.fields).to_numpy()[:2])
-    # What is beside no place is one more.
-    place = np.where(beside[at], owner[at], count)
-    verdict = fit.judge.compare(now.whole, then.whole, place, fit.judge.shown(closed), places=count + 1)
-    elsewhere, places = verdict.at(slice(count, None)), verdict.at(slice(count))
+    verdict = fit.judge.compare(
+        now.whole,
+        then.whole,
+        places.at(lattice_index(closed[0], subject.to_world, lattice.stride - 1)),
+        fit.judge.shown(closed),
+        places=places.count + 1,
+    )
+    elsewhere, each = verdict.at(slice(places.count, None)), verdict.at(slice(places.count))
     from_other = bool(elsewhere.accepted[0])
-    taken = ~places.reversed.accepted if from_other else places.accepted
-    taken_count = int(taken.sum())
+    taken = ~each.reversed.accepted if from_other else each.accepted
     if not (from_other or taken.any()):
-        return Merged(None, count, 0, elsewhere, None)
+        return Merged(None, places.count, 0, elsewhere, None)
     if from_other and taken.all():
         found, shown = other, then
     else:
         start = (other.fields, fields) if from_other else (fields, other.fields)
-        share = (taken != from_other)[owner] * np.clip(2 - away / _BESIDE, 0, 1)
-        mixed = _with_places(*start, share.ravel().astype(np.float32))
+        mixed = _with_places(*start, places.share(taken != from_other))
         found = _with_colors(fit, mixed, surface.seen.light)
         shown = fit.judge.shown(subject.surface_of(mixed).to_numpy()[:2])
     whole = fit.judge.compare(now.whole, shown.whole)
-    return Merged(found if whole.accepted[0] else None, count, taken_count, elsewhere, whole)
+    kept = found if whole.accepted[0] else None
+    return Merged(kept, places.count, int(taken.sum()), elsewhere, whole)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Places where two surfaces on one lattice differ by more than ``_DEEP`` cells.
+
+    Attributes:
+        count: how many there are.
+        owner: (N, N, N) number of the place that a lattice vertex is nearest to.
+        away: (N, N, N) cells from there.
+    """
+
+    count: int
+    owner: np.ndarray
+    away: np.ndarray
+
+    @classmethod
+    def between(cls, fields: LatticeFields, other: LatticeFields) -> _Places:
+        shape = (fields.lattice.stride,) * 3
+        inside, there = (_inside(values.reshape(shape)) for values in (fields.sdf, other.sdf))
+        differs = ((inside > 0) != (there > 0)) & (np.minimum(abs(inside), abs(there)) > _DEEP)
+        label, count = ndimage.label(differs, np.ones((3, 3, 3)))
+        if not count:
+            return cls(0, np.zeros(shape, int), np.full(shape, np.inf))
+        away, nearest = ndimage.distance_transform_edt(label == 0, return_indices=True)
+        return cls(count, label[tuple(nearest)] - 1, away)
+
+    def at(self, index: np.ndarray) -> np.ndarray:
+        """(V,) places that points, at (3, V) indices, are beside; what is beside none is one more."""
+        nearest = tuple(np.clip(np.rint(index).astype(int), 0, len(self.owner) - 1))
+        return np.where(self.away[nearest] <= _BESIDE, self.owner[nearest], self.count)
+
+    def share(self, chosen: np.ndarray) -> np.ndarray:
+        """(N^3,) 1 beside the (P,) chosen places, and falling to 0 over as many cells again."""
+        share = np.append(chosen, False)[self.owner] * np.clip(2 - self.away / _BESIDE, 0, 1)
+        return share.ravel().astype(np.float32)
 
 
 def _inside(sdf: np.ndarray) -> np.ndarray:
