@@ -11,6 +11,7 @@ import numpy as np
 from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..lattice import GRIDS, BlockLattice, Lattice
+from ..material import ATTRIBUTES
 from ..template.msdf import splat_to_lattice
 
 #: Median reflectance that the first split of radiance into material and light assumes.
@@ -129,6 +130,19 @@ class Surface:
     def with_fields(self, **fields: np.ndarray) -> Surface:
         """The surface with some of its lattice fields replaced."""
         return replace(self, fields=replace(self.fields, **fields))
+
+    def whole(self) -> Surface:
+        """The surface with fields and material on all of their lattice; what is not stored is as the nearest
+        vertex of all that are."""
+        lattice = self.lattice
+        if not isinstance(lattice, BlockLattice):
+            return self
+        spread = {
+            name: lattice.spread_out(mi.Float(values)).numpy()
+            for name, values in self.model.items()
+            if name in ATTRIBUTES
+        }
+        return replace(self, fields=self.fields.whole(), model={**self.model, **spread})
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The surface as flat arrays, for ``from_arrays``."""

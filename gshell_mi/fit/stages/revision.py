@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -90,15 +91,23 @@ class Revision:
         smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
         cut, near = reopened(lattice.spacing * values, revised <= 0, smooth, lattice.spacing)
         msdf = rewritten(mi.Float(fields.msdf), cut, near, template, lattice).numpy()
+        surface = replace(surface.with_fields(msdf=msdf), settled=False)
         elsewhere = (capped | deeper) & (revised > 0)
-        if not elsewhere.any():
-            return replace(surface.with_fields(msdf=msdf), settled=False)
-        points = mi.Transform4f(fit.scene.subject.to_world) @ mi.Point3f(lattice.points(mi.Float))
-        moved = np.where(elsewhere[:, None], recessed, vertices)
-        sdf, told = put_in_place(fields.sdf / lattice.spacing, points.numpy().T, vertices, moved, faces, cell)
-        sdf = (lattice.spacing * sdf).astype(np.float32)
-        msdf = np.where(told, np.maximum(np.abs(msdf), SURE * lattice.spacing), msdf).astype(np.float32)
-        return replace(surface.with_fields(sdf=sdf, msdf=msdf), settled=False)
+        return _moved(fit, surface, vertices, np.where(elsewhere[:, None], recessed, vertices), faces)
+
+
+def _moved(fit: Fit, surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray) -> Surface:
+    """The surface where vertices of its template, (V, 3), have moved, with no opening there."""
+    if (moved == vertices).all():
+        return surface
+    # It may move farther than the blocks reach that fields are stored in.
+    surface = surface.whole()
+    lattice, fields, cell = surface.lattice, surface.fields, fit.cell(surface)
+    points = lattice.points(mi.Float) + lattice.max_offset * dr.unravel(mi.Point3f, mi.Float(fields.deform))
+    points = (mi.Transform4f(fit.scene.subject.to_world) @ mi.Point3f(points)).numpy().T
+    sdf, told = put_in_place(fields.sdf / lattice.spacing, points, vertices, moved, faces, cell)
+    msdf = np.where(told, np.maximum(np.abs(fields.msdf), SURE * lattice.spacing), fields.msdf)
+    return surface.with_fields(sdf=(lattice.spacing * sdf).astype(np.float32), msdf=msdf.astype(np.float32))
 
 
 def _closed(judge: Judge, template: Shown, values: np.ndarray, opposite: np.ndarray) -> np.ndarray:

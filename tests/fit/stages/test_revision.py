@@ -1,6 +1,7 @@
 """What is open after all, and what is not, is told by the images on the surface that there is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -11,10 +12,14 @@ from cup import HALF, WALL, capture, cup, solid_block
 from scripted_judge import ScriptedJudge
 from silent_steps import Silent
 
+from gshell_mi.extraction import extract
+from gshell_mi.fields import sphere
 from gshell_mi.fit.judge import Judge
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.hull import Hull
-from gshell_mi.fit.stages.revision import Revision, _closed, _recessed
+from gshell_mi.fit.stages.revision import Revision, _closed, _moved, _recessed
+from gshell_mi.fit.surface import Surface
+from gshell_mi.lattice import TetLattice
 from gshell_mi.template.caps import Recesses
 from gshell_mi.topology import inner, topology
 
@@ -170,3 +175,27 @@ def test_what_a_recess_explains_as_well_does_not_open(fit, hull, monkeypatch, re
     assert not changed and loops(fit, found).boundary_loops == 0
     before, after = (vertices_of(fit, surface)[:, 1].max() for surface in (hull, found))
     assert after == before if not recess else not found.settled and after < before
+
+
+def test_a_surface_in_blocks_moves_farther_than_they_reach():
+    """A cap of a ball goes down by more cells than there are around it; colours stay where they are."""
+    ball = sphere(TetLattice(64), 0.6).in_blocks()
+    color = ball.lattice.points(mi.Float).x.numpy().repeat(3)
+    surface = Surface(ball, model={"vertex_color": color, "log_radiance": np.zeros(7)})
+    fit = SimpleNamespace(
+        scene=SimpleNamespace(subject=SimpleNamespace(to_world=mi.ScalarTransform4f())),
+        cell=lambda surface: surface.lattice.spacing,
+    )
+    vertices, faces, _ = extract(ball.lattice, mi.Float(ball.sdf)).to_numpy()
+    place = np.where(vertices[:, 2] > 0.45, 0, -1)
+    recessed = Recesses(vertices, faces, place).at(10 * ball.lattice.spacing)
+    found = _moved(fit, surface, vertices, recessed, faces)
+    again = extract(found.lattice, mi.Float(found.fields.sdf)).to_numpy()[0]
+    deepest = recessed[place == 0, 2].min()
+    middle = (np.hypot(again[:, 0], again[:, 1]) < 0.05) & (again[:, 2] > 0)
+    np.testing.assert_allclose(again[middle, 2], deepest, atol=ball.lattice.spacing)
+    assert found.fields.in_blocks().lattice.vertex_count < found.lattice.vertex_count
+    near = np.abs(ball.sdf) < ball.lattice.spacing
+    kept = ball.lattice.take(mi.Float(found.model["vertex_color"]))
+    np.testing.assert_array_equal(kept.numpy().reshape(-1, 3)[near], color.reshape(-1, 3)[near])
+    assert found.model["log_radiance"].shape == (7,)
