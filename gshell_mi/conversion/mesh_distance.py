@@ -68,13 +68,13 @@ def _find_nearest(
         start = stop
 
 
-def _nearest_of(mesh: trimesh.Trimesh, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Which of its k faces, (n, k), is nearest to each point."""
+def nearest_of(triangles: np.ndarray, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Which of its k faces, (n, k), of triangles (F, 3, 3) is nearest to each point. Needs a variant."""
     if faces.shape[1] == 1:
         return faces[:, 0]
     import mitsuba as mi
 
-    corners = _corners(mesh.triangles)
+    corners = _corners(triangles)
     point = mi.Point3f(np.ascontiguousarray(points.T, np.float32))
     least, nearest = dr.full(mi.Float, dr.inf, len(points)), dr.zeros(mi.UInt32, len(points))
     for column in faces.T:
@@ -145,7 +145,7 @@ class MeshFeet:
     def __call__(self, points: np.ndarray, faces: np.ndarray) -> Feet:
         """The feet of (n, 3) points, the nearest face being among the (n, k) given ones."""
         mesh = self.mesh
-        face = _nearest_of(mesh, points, faces)
+        face = nearest_of(mesh.triangles, points, faces)
         foot = trimesh.triangles.closest_point(mesh.triangles[face], points)
         weights = trimesh.triangles.points_to_barycentric(mesh.triangles[face], foot)
         vanishing = weights < 1e-5

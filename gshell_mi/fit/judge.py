@@ -78,6 +78,13 @@ class Verdict:
         """On the change taken back."""
         return Verdict(self.after, self.before, -self.gain, self.noise, self.rejected)
 
+    @classmethod
+    def together(cls, verdicts: list[Verdict]) -> Verdict:
+        """On all places of several verdicts, one after the other."""
+        each = ((given.before, given.after, given.gain, given.noise) for given in verdicts)
+        before, after, gain, noise = (np.concatenate(values) for values in zip(*each, strict=True))
+        return cls(before, after, gain, noise)
+
     def at(self, places: slice) -> Verdict:
         """On some of the places, as if no others had been asked for."""
         return Verdict(self.before[places], self.after[places], self.gain[places], self.noise[places])

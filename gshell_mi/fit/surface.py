@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import mitsuba as mi
@@ -132,17 +132,25 @@ class Surface:
         return replace(self, fields=replace(self.fields, **fields))
 
     def whole(self) -> Surface:
-        """The surface with fields and material on all of their lattice; what is not stored is as the nearest
-        vertex of all that are."""
+        """The surface with fields and material on all of their lattice, and neutral weights; what is not
+        stored is as the nearest vertex of all that are."""
         lattice = self.lattice
         if not isinstance(lattice, BlockLattice):
             return self
-        spread = {
-            name: lattice.spread_out(mi.Float(values)).numpy()
+        return replace(self, fields=self.fields.whole(), model=self._carried(lattice.spread_out))
+
+    def in_blocks(self) -> Surface:
+        """The surface with fields and material in blocks around it."""
+        fields = self.fields.in_blocks()
+        assert isinstance(fields.lattice, BlockLattice)
+        return replace(self, fields=fields, model=self._carried(fields.lattice.take))
+
+    def _carried(self, carry: Callable[[mi.Float], mi.Float]) -> dict[str, np.ndarray]:
+        """The model, that of it which lies on the lattice carried to other vertices."""
+        return {
+            name: carry(mi.Float(values)).numpy() if name in ATTRIBUTES else values
             for name, values in self.model.items()
-            if name in ATTRIBUTES
         }
-        return replace(self, fields=self.fields.whole(), model={**self.model, **spread})
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The surface as flat arrays, for ``from_arrays``."""

@@ -14,14 +14,16 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ...fields.smoothing import MeshDiffusion
-from ...template.caps import Recesses, least_bent, put_in_place
+from ...template.caps import Recesses, least_bent
+from ...template.moved_parts import with_moved_parts
 from ...template.msdf import clean_opacity, reopened, rewritten
 from ...template.sides import opposite_sides
 from ...topology import inner, lobes
 from ...triangles import positive_part
-from ..judge import Judge, places_of
+from ..judge import Judge, Verdict, places_of
 from ..radiance.acceptance import CLOSINGS, WORST, close_rejected, close_shallow
 from ..radiance.shown import Shown
 from ..radiance.surface_radiance import SurfaceRadiance
@@ -85,7 +87,7 @@ class Revision:
             revised = clean_opacity(revised, moved, faces, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
         steps.fact("openings_changed", bool(changed.any()))
-        steps.fact("recessed_vertices", int(deeper.sum()))
+        steps.fact("recessed_vertices", int((deeper & (revised > 0)).sum()))
         if not (changed | deeper).any():
             return surface
         smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
@@ -93,21 +95,28 @@ class Revision:
         msdf = rewritten(mi.Float(fields.msdf), cut, near, template, lattice).numpy()
         surface = replace(surface.with_fields(msdf=msdf), settled=False)
         elsewhere = (capped | deeper) & (revised > 0)
-        return _moved(fit, surface, vertices, np.where(elsewhere[:, None], recessed, vertices), faces)
+        moved = np.where(elsewhere[:, None], recessed, vertices)
+        return surface if (moved == vertices).all() else _moved(fit, surface, vertices, moved, faces, revised)
 
 
-def _moved(fit: Fit, surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray) -> Surface:
-    """The surface where vertices of its template, (V, 3), have moved, with no opening there."""
-    if (moved == vertices).all():
-        return surface
+def _moved(
+    fit: Fit, surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, values: np.ndarray
+) -> Surface:
+    """The surface where vertices of its template, (V, 3), have moved. It has no opening there but where the
+    (V,) values are negative."""
     # It may move farther than the blocks reach that fields are stored in.
-    surface = surface.whole()
+    blocks, surface = surface.fields.blocks is not None, surface.whole()
     lattice, fields, cell = surface.lattice, surface.fields, fit.cell(surface)
-    points = lattice.points(mi.Float) + lattice.max_offset * dr.unravel(mi.Point3f, mi.Float(fields.deform))
+    every = dr.arange(mi.UInt32, lattice.vertex_count)
+    points = lattice.offset_positions(every, mi.Float(fields.deform), mi.Float)
     points = (mi.Transform4f(fit.scene.subject.to_world) @ mi.Point3f(points)).numpy().T
-    sdf, told = put_in_place(fields.sdf / lattice.spacing, points, vertices, moved, faces, cell)
-    msdf = np.where(told, np.maximum(np.abs(fields.msdf), SURE * lattice.spacing), fields.msdf)
-    return surface.with_fields(sdf=(lattice.spacing * sdf).astype(np.float32), msdf=msdf.astype(np.float32))
+    sdf, told = with_moved_parts(fields.sdf / lattice.spacing, points, vertices, moved, faces, cell)
+    told = np.flatnonzero(told)
+    told = told[values[cKDTree(moved).query(points[told])[1]] > 0]
+    msdf = np.array(fields.msdf)
+    msdf[told] = np.maximum(np.abs(msdf[told]), SURE * lattice.spacing)
+    surface = surface.with_fields(sdf=(lattice.spacing * sdf).astype(np.float32), msdf=msdf)
+    return surface.in_blocks() if blocks else surface
 
 
 def _closed(judge: Judge, template: Shown, values: np.ndarray, opposite: np.ndarray) -> np.ndarray:
@@ -195,11 +204,14 @@ def _opened(
         return values, vertices
     place = places_of(opened, lobes(opened, faces))
     recesses = Recesses(vertices, faces, place)
-    depth, least = _recessed(
-        fit.judge, template, recesses, np.where(opened, -values, values), values, place, cell
-    )
+    closed = np.where(opened, -values, values)
+    depth, least = _recessed(fit.judge, template, recesses, closed, values, place, cell)
     values = np.where(opened & ~(least > 0)[place], -values, values)
-    return values, recesses.at(np.where(least > 0, 0, depth))
+    depth[least > 0] = 0
+    # Each was judged beside others that may have come out otherwise.
+    together = fit.judge.shown((recesses.at(depth), faces), like=template).part(values)
+    better = fit.judge.compare(now, together, place, template).gain > 0
+    return np.where(opened & ~better[place], closed, values), recesses.at(np.where(better, depth, 0))
 
 
 def _recessed(
@@ -228,12 +240,12 @@ def _recessed(
         surface; (P,) by how much at least an opening explains them better than a recess does.
     """
     now, holes = template.part(closed), template.part(opened)
-    best, depth, least = np.zeros((3, len(recesses.width)))
-    least += np.inf
-    for deep in recesses.depths(cell):
-        recess = judge.shown((recesses.at(deep), template.mesh[1]), like=template).part(closed)
-        least = np.minimum(least, judge.compare(recess, holes, place, template).gain)
-        verdict = judge.compare(now, recess, place, template)
-        better = verdict.accepted & (verdict.gain > best)
-        best, depth = np.where(better, verdict.gain, best), np.where(better, deep, depth)
-    return depth, least
+    depths, verdicts, openings = recesses.depths(cell), [], []
+    for depth in depths:
+        recess = judge.shown((recesses.at(depth), template.mesh[1]), like=template).part(closed)
+        verdicts.append(judge.compare(now, recess, place, template))
+        openings.append(judge.compare(recess, holes, place, template).gain)
+    tried = Verdict.together(verdicts)
+    gain = np.where(tried.accepted, tried.gain, 0).reshape(len(depths), -1)
+    best = gain.argmax(axis=0)
+    return np.where(gain.max(axis=0) > 0, np.array(depths)[best], 0), np.min(openings, axis=0)
