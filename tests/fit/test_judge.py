@@ -119,3 +119,12 @@ def test_many_places_that_are_all_better_are_all_accepted():
 def test_a_place_that_hardly_a_view_tells_of_makes_others_no_less_sure():
     gain, noise = np.array([0.21] + 30 * [0.0]), np.array([0.1] + 30 * [np.inf])
     assert Verdict(gain, gain, gain, noise).accepted.tolist() == [True] + 30 * [False]
+
+
+def test_verdicts_together_are_one_family():
+    def of(z: float) -> Verdict:
+        return Verdict(*np.full((3, 1), 0.1 * z), np.full(1, 0.1))
+
+    together = Verdict.together([of(2.1), *[of(0.0)] * 5])
+    assert of(2.1).accepted.all() and not together.accepted.any()
+    np.testing.assert_allclose(together.gain, [0.21, *[0] * 5])
