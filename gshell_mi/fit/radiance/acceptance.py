@@ -105,23 +105,37 @@ def close_rejected(
     return np.where(opened & ~kept, -logits, logits)
 
 
-def open_rejected(logits: np.ndarray, template: Shown, judge: Judge) -> np.ndarray:
+def islands(solid: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(V,) which ``solid`` (V,) vertices of a template are on islands, smaller than what else hangs together
+    on the same piece, and (V,) ids of what hangs together.
+
+    >>> islands(np.array([True, False, True, True]), np.array([[0, 1, 1], [1, 2, 3]]))[0].tolist()
+    [True, False, False, False]
+    """
+    patch = equal_patches(solid, faces)
+    piece = vertex_components(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(solid))[1]
+    size, largest = patch_sizes(patch, piece, solid)
+    return solid & (size < largest), patch
+
+
+def open_rejected(
+    logits: np.ndarray, template: Shown, judge: Judge, given: np.ndarray | None = None
+) -> np.ndarray:
     """Opens the islands in openings that unseen views do not speak for.
 
     A highlight on the inside of a bowl may be explained by a piece of the lid.
 
     Args:
         logits, template, judge: as of ``close_rejected``.
+        given: (V,) islands that have been justified; default: none.
 
     Returns:
         (V,) logits, those of rejected islands negated.
     """
-    faces = template.mesh[1]
     solid = logits > 0
-    patch = equal_patches(solid, faces)
-    piece = vertex_components(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(logits))[1]
-    size, largest = patch_sizes(patch, piece, solid)
-    island = solid & (size < largest)
+    island, patch = islands(solid, template.mesh[1])
+    if given is not None:
+        island &= ~given
     if not island.any():
         return logits
     place = places_of(island, patch)

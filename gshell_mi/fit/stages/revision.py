@@ -24,7 +24,7 @@ from ...template.sides import opposite_sides
 from ...topology import inner, lobes
 from ...triangles import positive_part
 from ..judge import Judge, Verdict, places_of
-from ..radiance.acceptance import CLOSINGS, WORST, close_rejected, close_shallow
+from ..radiance.acceptance import CLOSINGS, WORST, close_rejected, close_shallow, islands, open_rejected
 from ..radiance.shown import Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
@@ -195,10 +195,13 @@ def _opened(
         cleaned = clean_opacity(both, vertices, faces, fit.config.topology.min_area)
         return np.where(given, values, close_shallow(np.where(given, 1.0, cleaned), faces, thin))
 
-    start = np.where(given, values, np.abs(proposed))
-    values = justified(
-        proposed, start, clean, lambda candidate: close_rejected(candidate, template, fit.judge, now, given)
-    )
+    start, standing = np.where(given, values, np.abs(proposed)), islands(~given, faces)[0]
+
+    def judged(candidate: np.ndarray) -> np.ndarray:
+        kept = close_rejected(candidate, template, fit.judge, now, given)
+        return open_rejected(kept, template, fit.judge, standing)
+
+    values = justified(proposed, start, clean, judged)
     opened = (values <= 0) & ~given
     if not opened.any():
         return values, vertices

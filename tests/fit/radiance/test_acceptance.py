@@ -126,6 +126,13 @@ def test_without_islands_nothing_is_asked(ball):
     assert open_rejected(logits, judge.shown((ball.vertices, ball.faces)), judge) is logits
 
 
+def test_an_island_that_has_been_justified_is_not_asked_for(ball):
+    island, around = cap(ball, [0, 0, 1], 0.02), cap(ball, [0, 0, 1], 0.2)
+    logits = np.where(around & ~island, -1.0, 2.0)
+    judge = ScriptedJudge(len(logits), None)
+    assert open_rejected(logits, judge.shown((ball.vertices, ball.faces)), judge, island) is logits
+
+
 def test_nothing_open_nothing_asked(ball):
     logits = np.ones(len(ball.vertices))
     judge = ScriptedJudge(len(logits), None)
