@@ -131,8 +131,8 @@ class _Places:
         return np.where(self.away[nearest] <= _BESIDE, self.owner[nearest], self.count)
 
     def share(self, chosen: np.ndarray) -> np.ndarray:
-        """(N^3,) 1 beside the (P,) chosen places, and falling to 0 over as many cells again."""
-        share = np.append(chosen, False)[self.owner] * np.clip(2 - self.away / _BESIDE, 0, 1)
+        """(N^3,) 1 beside the (P,) chosen places, P not 0, and falling to 0 over as many cells again."""
+        share = chosen[self.owner] * np.clip(2 - self.away / _BESIDE, 0, 1)
         return share.ravel().astype(np.float32)
 
 
