@@ -16,20 +16,18 @@ from .compat import environment_data, environment_radiance
 MINIMUM_RADIANCE = 1e-4
 
 
-def turns_with_camera(sensors: list[mi.Sensor]) -> list[mi.ScalarTransform4f]:
+def turns_with_camera(sensors: list[mi.Sensor]) -> np.ndarray:
     """Rotations of a light that is fixed to the camera, as where an object turns on a turntable.
 
     Returns:
-        For each sensor the rotation from the world as the first one sees it.
+        (N, 3, 3) for each sensor the rotation from the world as the first one sees it.
     """
     axes = [
         np.array(mi.traverse(sensor)["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
         for sensor in sensors
     ]
     axes = [matrix / np.linalg.norm(matrix, axis=0) for matrix in axes]
-    turns = np.tile(np.eye(4), (len(axes), 1, 1))
-    turns[:, :3, :3] = [matrix @ axes[0].T for matrix in axes]
-    return [mi.ScalarTransform4f(turn) for turn in turns]
+    return np.array([matrix @ axes[0].T for matrix in axes])
 
 
 class EnvironmentLight:
@@ -74,9 +72,11 @@ class EnvironmentLight:
     def radiance(self) -> mi.TensorXf:
         return dr.exp(self.log_radiance)
 
-    def turned(self, turn: mi.ScalarTransform4f) -> mi.Transform4f:
-        """``to_world`` of the emitter where the light has turned."""
-        return mi.Transform4f(turn @ self._to_world)
+    def turned(self, turn: np.ndarray) -> mi.Transform4f:
+        """``to_world`` of the emitter where the light has turned, by a rotation (3, 3)."""
+        rotation = np.eye(4)
+        rotation[:3, :3] = turn
+        return mi.Transform4f(mi.ScalarTransform4f(rotation) @ self._to_world)
 
     @cached_property
     def solid_angles(self) -> mi.TensorXf:

@@ -31,12 +31,14 @@ class PinholeViews:
         sizes: (N, 2) integers, width and height of each crop window in pixels.
         origins: (N, 3) centres of projection, world units.
         bases: (N, 3, 3) as above, world units.
+        turns: (N, 3, 3) how what surrounds the object has turned in each view; None if it stays.
     """
 
     ids: tuple[str, ...]
     sizes: np.ndarray
     origins: np.ndarray
     bases: np.ndarray
+    turns: np.ndarray | None = None
 
     @classmethod
     def from_sensors(cls, sensors: list[mi.Sensor]) -> PinholeViews:
@@ -118,6 +120,19 @@ class PinholeViews:
     def origins_of(self, view: mi.UInt32) -> mi.Point3f:
         """Centres of projection of the views with index ``view``."""
         return dr.gather(mi.Point3f, self._table, 4 * view + 3)
+
+    def in_surroundings(self, view: mi.UInt32, direction: mi.Vector3f) -> mi.Vector3f:
+        """Directions in the frame of what surrounds the object in the views with index ``view``."""
+        if self.turns is None:
+            return direction
+        axes = (dr.gather(mi.Vector3f, self._turn_table, 3 * view + axis) for axis in range(3))
+        return mi.Vector3f(*(dr.dot(axis, direction) for axis in axes))
+
+    @cached_property
+    def _turn_table(self) -> mi.Float:
+        """Three vectors per view on the device: the columns of its turn."""
+        assert self.turns is not None
+        return mi.Float(self.turns.transpose(0, 2, 1).ravel())
 
     def pixel_size(self, view: mi.UInt32) -> mi.Float:
         """Width of a pixel at depth 1 along the axis, in world units."""

@@ -1,8 +1,11 @@
 """Pinhole geometry against Mitsuba's own sensors."""
 
+import dataclasses
+
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gshell_mi.views import PinholeViews
 
@@ -39,3 +42,15 @@ def test_rays_are_those_of_the_sensor_and_projection_inverts_them(kind, crop):
     at, depth = views.project(0, ray(2.5))
     np.testing.assert_allclose(np.array(at), np.array(film), atol=1e-4)
     assert np.array(depth).min() > 0
+
+
+def test_directions_in_surroundings_that_turn():
+    sensors = [mi.load_dict({"type": "perspective"}) for _ in range(3)]
+    views = PinholeViews.from_sensors(sensors)
+    direction = mi.Vector3f([0.6, 0, 0], [0, 1, 0], [0.8, 0, 1])
+    assert views.in_surroundings(mi.UInt32(0, 1, 2), direction) is direction
+    turns = Rotation.random(3, random_state=0).as_matrix()
+    turning = dataclasses.replace(views, turns=turns)
+    found = turning.in_surroundings(mi.UInt32(2, 0, 1), direction).numpy()
+    expected = np.einsum("ncr,cn->rn", turns[[2, 0, 1]], direction.numpy())
+    np.testing.assert_allclose(found, expected, atol=1e-6)

@@ -100,7 +100,7 @@ def fit_scene(
                 before_targets=memory.check,
                 on_reference=progress.reference,
             )
-            fit = Fit(loaded, config, Lattices.of(loaded.subject, config))
+            fit = Fit.of(loaded, config)
             _check_inputs(fit, checkpoint, resume)
             folder.check(
                 scene_inputs(scene) | loaded.target_files,
@@ -192,7 +192,7 @@ def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report:
             fit.config.triptychs,
             fitted.texture,
             fitted.texture_levels,
-            light_turns=fit.config.light_frame == "camera",
+            light_turns=fit.light_turns,
             gains=surface.gains,
         )
         metrics["config"] = dataclasses.asdict(fit.config)

@@ -67,9 +67,10 @@ class FitConfig:
     """Steps of the joint stage."""
     known_light: bool = False
     """Keep the scene's light as it is instead of optimising it."""
-    light_frame: Literal["world", "camera"] = "world"
+    light_frame: Literal["find", "world", "camera"] = "find"
     """What the light is fixed to: the world, or the camera, as where an object turns on a turntable before
-    a camera on a tripod. The exported light is then as the first view has it."""
+    a camera on a tripod, or where a flash is on the camera; or find which, by what views see of the same
+    places. If to the camera, the exported light is as the first view has it."""
     fixed_material: bool = False
     """Keep the uniform principled material that the scene gives the gshell shape."""
     exposures: Literal["find", "keep"] = "find"

@@ -11,6 +11,7 @@ from .stages.cavities import Cavities
 from .stages.exposures import Exposures
 from .stages.hull import Given, Hull
 from .stages.joint import Joint
+from .stages.light_frame import LightFrame
 from .stages.occlusion import Occlusion
 from .stages.openings import Openings
 from .stages.poses import Poses
@@ -36,6 +37,8 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
             *([Occlusion(config.occlusion)] if config.occlusion.most else []),  # masks that are wrong
             Hull(config.hull),  # what the masks leave
         ]
+    if config.light_frame == "find" and not (config.known_light or config.geometry_only):
+        start.append(LightFrame(config.gains))  # whether the light turns with the camera
     found = config.exposures == "find" and not config.geometry_only
     exposures: list[Stage] = [Exposures(config.gains)] if found else []
     if given and not Given.is_closed(scene, lattices, config):

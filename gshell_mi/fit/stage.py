@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from ..light import turns_with_camera
 from ..packed_pixels import unpacked
 from ..pixels import PixelPool
 from ..scene import FitScene
@@ -35,16 +36,24 @@ class Fit:
         scene: with its targets. Path tracing sets the fields of its shape; no other stage reads them.
         config: the settings.
         lattices: that stages work on.
+        light_turns: whether the light turns with the camera.
     """
 
     scene: FitScene
     config: FitConfig
     lattices: Lattices
+    light_turns: bool = False
+
+    @classmethod
+    def of(cls, scene: FitScene, config: FitConfig) -> Fit:
+        """Of what is given."""
+        return cls(scene, config, Lattices.of(scene.subject, config), config.light_frame == "camera")
 
     @cached_property
     def views(self) -> PinholeViews:
         """The cameras."""
-        return PinholeViews.from_sensors(self.scene.sensors)
+        views, sensors = PinholeViews.from_sensors(self.scene.sensors), self.scene.sensors
+        return replace(views, turns=turns_with_camera(sensors)) if self.light_turns else views
 
     @cached_property
     def alphas(self) -> list[np.ndarray]:
@@ -84,7 +93,7 @@ class Fit:
 
     def corrected(self, surface: Surface) -> Fit:
         """The same with what was found of the views: targets as if all were exposed alike, without what is
-        ignored, and cameras where they are.
+        ignored, cameras where they are, and what the light is fixed to.
 
         The pools of this one are let go, and made again if they are asked for: two of each would be as large
         as the targets many times over.
@@ -104,7 +113,8 @@ class Fit:
             ]
         if surface.poses is not None:
             sensors = Corrections.from_array(surface.poses).sensors(sensors)
-        return replace(self, scene=replace(self.scene, sensors=sensors, targets=targets))
+        turns = self.light_turns if surface.light_turns is None else bool(surface.light_turns)
+        return replace(self, scene=replace(self.scene, sensors=sensors, targets=targets), light_turns=turns)
 
     def cell(self, surface: Surface) -> float:
         """Side of a cell of a surface's lattice in world units."""

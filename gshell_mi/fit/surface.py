@@ -28,7 +28,7 @@ _BRIGHTEST = 0.98
 _FIELDS, _OPTIONAL = ("sdf", "msdf", "deform"), ("weights", "blocks")
 
 #: What is found of the views.
-_OF_VIEWS = "gains", "ignored", "poses"
+_OF_VIEWS = "gains", "ignored", "poses", "light_turns"
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,7 @@ class Surface:
         gains: (N, 3) what each view's channels are multiplied by, as it was exposed; None if by nothing.
         ignored: pixels that tell nothing, of all views one after the other, eight to a byte; None for none.
         poses: (N, 6) corrections of the cameras, as of ``Corrections``; None if they are as given.
+        light_turns: () whether the light turns with the camera; None if that is as the settings say.
     """
 
     fields: LatticeFields
@@ -107,6 +108,7 @@ class Surface:
     gains: np.ndarray | None = None
     ignored: np.ndarray | None = None
     poses: np.ndarray | None = None
+    light_turns: np.ndarray | None = None
 
     @property
     def lattice(self) -> Lattice | BlockLattice:

@@ -16,8 +16,9 @@ from gshell_mi.fit.pipeline import pipeline
 from gshell_mi.lattice import TetLattice
 
 END = ["poses", "revision", "detail", "texture"]
-START = ["openings", "exposures", "cavities", "refinement", "folds", "revoxelise"]
+START = ["light", "openings", "exposures", "cavities", "refinement", "folds", "revoxelise"]
 KEPT = [stage for stage in START if stage != "exposures"]
+GEOMETRY = [stage for stage in KEPT if stage != "light"]
 
 
 def names(subject: mi.Shape, settings: dict) -> list[str]:
@@ -35,7 +36,9 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
         ({"detail.iterations": 0}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
         ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
         ({"exposures": "keep"}, ["occlusion", "hull", *KEPT, "volume", "joint", *END]),
-        ({"geometry_only": True}, ["occlusion", "hull", *KEPT, "volume", "joint", *END]),
+        ({"geometry_only": True}, ["occlusion", "hull", *GEOMETRY, "volume", "joint", *END]),
+        ({"light_frame": "world"}, ["occlusion", "hull", *START[1:], "volume", "joint", *END]),
+        ({"known_light": True}, ["occlusion", "hull", *START[1:], "volume", "joint", *END]),
         ({"occlusion.most": 0.0}, ["hull", *START, "volume", "joint", *END]),
         (
             {"poses": "keep"},
@@ -59,8 +62,8 @@ def test_stages_from_masks(settings, expected):
 @pytest.mark.parametrize(
     ("opened", "settings", "expected"),
     [
-        (True, {}, ["given", "exposures", "joint", "poses", "detail", "texture"]),
-        (True, {"exposures": "keep"}, ["given", "joint", "poses", "detail", "texture"]),
+        (True, {}, ["given", "light", "exposures", "joint", "poses", "detail", "texture"]),
+        (True, {"exposures": "keep"}, ["given", "light", "joint", "poses", "detail", "texture"]),
         (False, {}, ["given", *START, "joint", "poses", "detail", "texture"]),
         (True, {"watertight": True}, ["given", *START, "joint", "poses", "detail", "texture"]),
     ],

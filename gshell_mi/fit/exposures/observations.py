@@ -76,7 +76,6 @@ def observe(
     *,
     places: int,
     cell: float,
-    turns: np.ndarray | None = None,
     seed: int = 0,
 ) -> Observations:
     """Looks at random vertices of a mesh from all views.
@@ -89,7 +88,6 @@ def observe(
         views, targets: the images.
         places: vertices that are looked at, at most.
         cell: side of a cell, world units.
-        turns: (N, 3, 3) rotation of the light in each view, if it turns with the camera.
         seed: of the vertices.
     """
     vertices, faces = mesh
@@ -126,8 +124,8 @@ def observe(
         normal = np.where(back[:, None], -normals[index], normals[index])
         toward = outwards[index]
         directions = normal, 2 * np.abs(cosine[index])[:, None] * normal - toward, toward
-        if turns is not None:
-            directions = tuple(vectors @ turns[view] for vectors in directions)
+        if views.turns is not None:
+            directions = tuple(vectors @ views.turns[view] for vectors in directions)
         found.append(
             (
                 2 * index + back,

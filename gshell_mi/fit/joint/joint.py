@@ -14,7 +14,7 @@ from ...errors import UserError
 from ...fields import LatticeFields
 from ...fields.smoothing import LatticeDiffusion
 from ...images import decibels
-from ...light import EnvironmentLight, turns_with_camera
+from ...light import EnvironmentLight
 from ...material import GivenMaterial, MaterialField, principled
 from ...means import mean
 from ...outliers import finite
@@ -54,6 +54,7 @@ class JointStage:
         config: what all stages know.
         stage: settings of the stage; default: those of the joint stage.
         iterations: its steps; default: those of the joint stage.
+        turns: (N, 3, 3) how the light has turned in each view; None if it stays.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class JointStage:
         *,
         stage: JointConfig | None = None,
         iterations: int | None = None,
+        turns: np.ndarray | None = None,
     ):
         self.given, self.material, self.light, self.config = given, material, light, config
         self.stage = stage or config.joint
@@ -75,8 +77,7 @@ class JointStage:
             self.subject.attach_attribute(name, field)
         self.scene = optimised_scene(given, light)
         self.parameters = mi.traverse(self.scene)
-        #: Per view, how the light has turned; none if it stays.
-        self._turns = turns_with_camera(given.sensors) if light and config.light_frame == "camera" else []
+        self._turns = turns if light else None
         #: Per view the share of each pixel that is known, None if that is all. The rest is black in images.
         known = [np.asarray(target.known)[..., None] for target in given.targets]
         self._known = [None if share.all() else mi.TensorXf(share) for share in known]
@@ -141,7 +142,7 @@ class JointStage:
                 of_color, of_mask = self._image_loss(view, image), self._mask_loss(view, image)
                 of_view = (of_color + self.config.losses.mask * of_mask) / len(views)
                 compute(of_view)
-            if self._turns:
+            if self._turns is not None:
                 # The light has to be where it was when the image is differentiated. If it stays, one pass
                 # through the extraction serves all views.
                 with phase("backward"):
@@ -227,7 +228,7 @@ class JointStage:
 
     def _render(self, view: int, seed: int) -> mi.TensorXf:
         config = self.config.render
-        if self.light and self._turns:
+        if self.light and self._turns is not None:
             self.parameters["light.to_world"] = self.light.turned(self._turns[view])
             self.parameters.update()
         with phase("render") as compute:

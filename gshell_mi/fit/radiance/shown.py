@@ -220,7 +220,7 @@ class Shown:
             lane = chosen_lanes(~solid, solid)
         for layer in self._layers(pixel.at(lane) if first else pixel, values):
             lane = dr.gather(mi.UInt32, lane, layer.lane)
-            met = self._met(layer)
+            met = self._met(layer, dr.gather(mi.UInt32, pixel.view, lane))
             yield lane, replace(met, hit=met.values_at(values) > 0) if values is not None else met
 
     @cached_property
@@ -252,7 +252,8 @@ class Shown:
             if covered:
                 sample = sample.at(chosen_lanes(sample.alpha > COVERED, sample))
             for layer in self._layers(sample, None):
-                found.append(FirstHits(sample.at(layer.lane), self._met(layer)))
+                pixel = sample.at(layer.lane)
+                found.append(FirstHits(pixel, self._met(layer, pixel.view)))
                 dr.eval(found[-1])
         # Arrays are never empty: a pixel whose ray meets nothing.
         return joined_lanes(found) if found else FirstHits(pixels.sample(1, seed=0, step=0), Met.nothing())
@@ -299,12 +300,13 @@ class Shown:
             lambda layer: layer.interpolate(values) <= 0,
         )
 
-    def _met(self, layer: Layer) -> Met:
+    def _met(self, layer: Layer, view: mi.UInt32) -> Met:
+        """Where rays of some views meet a layer."""
         normal = interpolated(mi.Vector3f, self._normals, layer.face, layer.weights)
         return Met(
             [layer.side(corner) for corner in layer.face],
             list(layer.weights),
-            mirrored_direction(dr.normalize(layer.direction), normal),
+            self.views.in_surroundings(view, mirrored_direction(dr.normalize(layer.direction), normal)),
             dr.full(mi.Bool, True, dr.width(layer.lane)),
         )
 

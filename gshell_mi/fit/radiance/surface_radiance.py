@@ -164,7 +164,7 @@ class SurfaceRadiance:
     def render(self, step: int) -> tuple[PixelSample, mi.Color3f, mi.Float, list[Layer]]:
         """The random pixels of a step, their radiance and coverage, and the layers behind them."""
         sample, layers = self.look(step)
-        radiance, alpha = self.composite(layers, dr.width(sample.view))
+        radiance, alpha = self.composite(layers, sample.view)
         # Each of the losses would do this again.
         dr.eval(radiance, alpha)
         return sample, radiance, alpha, layers
@@ -173,10 +173,6 @@ class SurfaceRadiance:
         """The random pixels of a step, and the layers that the rays through them meet."""
         sample = self.pixels.sample(self.config.batch, seed=self.seed, step=step)
         return sample, self._layers(self.views.rays(sample.view, sample.film))
-
-    def see(self, ray: mi.Ray3f) -> tuple[mi.Color3f, mi.Float]:
-        """Radiance and coverage along rays."""
-        return self.composite(self._layers(ray), dr.width(ray.d))
 
     def update(self, names: tuple[str, ...], rate: float) -> None:
         """Steps the parameters ``names``; the others rest.
@@ -244,12 +240,12 @@ class SurfaceRadiance:
             goes_on if self._opacity_rests else None,
         )
 
-    def composite(self, layers: list[Layer], count: int) -> tuple[mi.Color3f, mi.Float]:
+    def composite(self, layers: list[Layer], view: mi.UInt32) -> tuple[mi.Color3f, mi.Float]:
         """Compositing (Porter and Duff 1984, *over*) of radiance and coverage.
 
         Args:
             layers: what the rays meet, from ``look``.
-            count: of rays.
+            view: index of the view that each of the rays is of.
 
         Returns:
             Radiance and coverage of every ray.
@@ -258,15 +254,18 @@ class SurfaceRadiance:
         if self._opacity_rests:
             opacity = dr.detach(opacity)  # its derivatives would take as long as those of the radiance
         radiance, transmittance = mi.Color3f(0), mi.Float(1)
-        fronts = [count, *(dr.width(layer.lane) for layer in layers)]
-        # From the last to the first: each has lanes of its own.
-        for layer, width in reversed(list(zip(layers, fronts, strict=False))):
+        # Each layer has lanes of its own.
+        views = [view]
+        for layer in layers:
+            views.append(dr.gather(mi.UInt32, views[-1], layer.lane))
+        for layer, of_layer, in_front in reversed(list(zip(layers, views[1:], views, strict=False))):
+            width = dr.width(in_front)
             sides = [layer.side(corner) for corner in layer.face]
             color = interpolated(mi.Color3f, self.optimizer["radiance"], sides, layer.weights)
             color = softplus(color)
             if self._mirrored:
                 mirrored = mirrored_direction(dr.normalize(layer.direction), self._normal(layer))
-                color *= self._mirrored.factor(mirrored)
+                color *= self._mirrored.factor(self.views.in_surroundings(of_layer, mirrored))
             alpha = sigmoid(layer.interpolate(opacity))
             radiance = _spread(dr.lerp(radiance, color, alpha), layer.lane, 0, width)
             transmittance = _spread((1 - alpha) * transmittance, layer.lane, 1, width)

@@ -83,7 +83,7 @@ class PhotometricRefinement:
         appearance.move(dr.detach(positions))
         sample, layers = appearance.look(iteration)
         attached = [replace(layer, weights=_barycentric(positions, layer)) for layer in layers]
-        radiance, _ = appearance.composite(attached, dr.width(sample.view))
+        radiance, _ = appearance.composite(attached, sample.view)
         share = appearance.pixels.share
         image = share * losses.log_l1(radiance, sample.radiance)
         total, outline = image, mi.Float(0)

@@ -11,7 +11,6 @@ from typing import Annotated
 
 import numpy as np
 
-from ...light import turns_with_camera
 from ..bounds import Between
 from ..exposures.gains import find_gains
 from ..exposures.observations import observe
@@ -45,9 +44,6 @@ class Exposures:
         """The surface with the gains of the views, or with none if they do not count."""
         config, scene = fit.config, fit.scene
         with steps.task():
-            turns = None
-            if config.light_frame == "camera":
-                turns = np.array([np.array(turn.matrix)[:3, :3] for turn in turns_with_camera(scene.sensors)])
             mesh = scene.subject.surface_of(surface.fields).to_numpy()[:2]
             seen = observe(
                 mesh,
@@ -55,7 +51,6 @@ class Exposures:
                 scene.targets,
                 places=self.config.places,
                 cell=fit.cell(surface),
-                turns=turns,
                 seed=config.seed,
             )
             found = find_gains(seen, self.config.prior * np.log(2))

@@ -114,6 +114,7 @@ class Joint:
             config,
             stage=self.config,
             iterations=self.iterations,
+            turns=fit.views.turns,
         )
         if joint.geometry.fitting_steps and not steps.done:
             with steps.task("start", joint.geometry.fitting_steps) as advance:

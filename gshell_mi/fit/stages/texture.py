@@ -8,7 +8,6 @@ from typing import Annotated
 import mitsuba as mi
 import numpy as np
 
-from ...light import turns_with_camera
 from ...material import attributes_of
 from ...subdivision import subdivided
 from ...triangles import unit, vertex_areas
@@ -61,8 +60,8 @@ class Texture:
             fine["vertex_roughness"],
             fine["vertex_metallic"],
         )
-        turns = fit.config.light_frame == "camera" and fitted.light
-        lights = [fitted.light.turned(turn) for turn in turns_with_camera(fit.scene.sensors)] if turns else []
+        turns = fit.views.turns if fitted.light else None
+        lights = [] if turns is None else [fitted.light.turned(turn) for turn in turns]
         work = BackProjection(
             start,
             other_objects(fit.scene, fitted.light),

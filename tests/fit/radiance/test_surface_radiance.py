@@ -59,9 +59,13 @@ FRONT = np.array([[1.0, 0.5, 0.2], [0.1, 2.0, 0.4]])
 BACK = np.array([[0.3, 0.3, 3.0], [0.7, 0.2, 0.6]])
 
 
+def see(appearance, origin, direction):
+    layers = appearance._layers(mi.Ray3f(origin, direction))
+    return appearance.composite(layers, mi.UInt32(0))
+
+
 def composite(appearance, origin, direction):
-    ray = mi.Ray3f(origin, direction)
-    radiance, alpha = appearance.see(ray)
+    radiance, alpha = see(appearance, origin, direction)
     return np.ravel(radiance), np.ravel(alpha)[0]
 
 
@@ -107,8 +111,7 @@ def test_derivatives_of_coverage(sheets):
     opacity = mi.Float(sheets.optimizer["opacity"])
     dr.enable_grad(opacity)
     old, sheets.optimizer["opacity"] = sheets.optimizer["opacity"], opacity
-    ray = mi.Ray3f([0.1, 0.2, 5], [0, 0, -1])
-    _, alpha = sheets.see(ray)
+    _, alpha = see(sheets, [0.1, 0.2, 5], [0, 0, -1])
     dr.backward(alpha)
     gradient = dr.grad(sheets.optimizer["opacity"]).numpy().reshape(2, 4).sum(1)
     sheets.optimizer["opacity"] = dr.detach(old)

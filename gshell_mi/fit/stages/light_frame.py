@@ -1,0 +1,57 @@
+"""Light frame: whether the light is fixed to the world, or turns with the camera.
+
+Where an object turns before a camera on a tripod, or a flash is on the camera, the light comes from the same
+side in every view, wherever that is in the object's own frame. In the wrong frame, highlights and shading are
+neither gloss nor light, and end as colour and as shape.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...light import turns_with_camera
+from ..exposures.observations import observe
+from ..exposures.regression import ColorModel
+from ..judge import verdict_of
+from ..runner import Steps
+from ..stage import Fit
+from ..surface import Surface
+from .exposures import GainsConfig
+
+
+class LightFrame:
+    """Asks in which frame directions explain better what views see of the same places.
+
+    Each region of the surface is foretold by the others, by polynomials of the mirrored direction and of the
+    normal, once in the world's frame and once in the camera's. The light turns with the camera if that is
+    better by the judge's rule; where nothing is glossy and nothing turns, neither is.
+    """
+
+    name = "light"
+
+    def __init__(self, config: GainsConfig):
+        self.config = config
+
+    def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
+        """The surface with what the light is fixed to."""
+        with steps.task():
+            mesh = fit.scene.subject.surface_of(surface.fields).to_numpy()[:2]
+            told = []
+            for turns in (None, turns_with_camera(fit.scene.sensors)):
+                seen = observe(
+                    mesh,
+                    replace(fit.views, turns=turns),
+                    fit.scene.targets,
+                    places=self.config.places,
+                    cell=fit.cell(surface),
+                    seed=fit.config.seed,
+                )
+                told.append(ColorModel(seen, self.config.prior * np.log(2)).foretold())
+            world, camera = told
+            verdict = verdict_of(world.rays[None], world.errors[None], camera.errors[None])
+        turns = bool(verdict.accepted[0])
+        steps.fact("light_frame_verdict", verdict.facts())
+        steps.fact("light_frame", "camera" if turns else "world")
+        return replace(surface, light_turns=np.array(True)) if turns else surface
