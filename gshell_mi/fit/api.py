@@ -195,6 +195,7 @@ def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report:
             light_turns=fit.light_turns,
             gains=surface.gains,
         )
+        metrics["light_frame"] = "camera" if fit.light_turns else "world"
         metrics["config"] = dataclasses.asdict(fit.config)
         metrics |= fitted.findings(fit, progress.warn) | {"warnings": progress.warnings}
 

@@ -21,7 +21,14 @@ _NEEDED = {
 }
 
 #: Those that may be missing.
-_OPTIONAL = {"warnings": list, "diagnostics": dict, "held_out": dict, "exposures": dict, "poses": dict}
+_OPTIONAL = {
+    "warnings": list,
+    "diagnostics": dict,
+    "held_out": dict,
+    "exposures": dict,
+    "poses": dict,
+    "light_frame": str,
+}
 
 #: Entries within them that a page takes for numbers.
 _NUMBERS = {"counts": ("vertices", "faces", "boundary_loops", "components"), "seconds": ("total",)}

@@ -72,6 +72,7 @@ def folder(tmp_path_factory):
                 "warnings": ["1 floater <here>"],
                 "diagnostics": {"floaters": 1},
                 "poses": {"views": {"view_000": {"pixels": 0.3, "degrees": 0.02}}},
+                "light_frame": "camera",
                 "peak_memory_mib": 900,
                 "variant": "llvm_ad_rgb",
                 "config": asdict(FitConfig()),
@@ -148,9 +149,12 @@ def test_a_fit_to_all_views(folder, tmp_path):
         shutil.rmtree(tmp_path / "fit" / name)
     metrics = json.loads((folder / "metrics.json").read_text())
     del metrics["held_out"]
+    metrics["light_frame"] = "world"
     (tmp_path / "fit" / "metrics.json").write_text(json.dumps(metrics))
     page = write_report(tmp_path / "fit", SMALL).read_text().partition('<script type="module">')[0]
     assert "<h2>Training views</h2>" in page and "eld-out" not in page and "<h2>Masks</h2>" not in page
+    assert "It turns with the camera" not in page
+    assert "It turns with the camera" in (folder / "report.html").read_text()
 
 
 METRICS = {

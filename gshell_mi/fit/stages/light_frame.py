@@ -53,5 +53,4 @@ class LightFrame:
             verdict = verdict_of(world.rays[None], world.errors[None], camera.errors[None])
         turns = bool(verdict.accepted[0])
         steps.fact("light_frame_verdict", verdict.facts())
-        steps.fact("light_frame", "camera" if turns else "world")
         return replace(surface, light_turns=np.array(True)) if turns else surface
