@@ -16,8 +16,8 @@ import numpy as np
 
 from ...pixels import DARK
 
-#: Degree of the spherical harmonics: about what a lobe of roughness 0.2 leaves of the surroundings. With four,
-#: the gilded crown of a bronze head is taken for a window.
+#: Degree of the spherical harmonics: about what a lobe of roughness 0.2 leaves of the surroundings. With 4,
+#: the gilded crown of a bronze head is a window.
 _DEGREE = 6
 
 #: Number of harmonics without the constant one.
@@ -29,8 +29,8 @@ _LEAST = 0.1
 #: Relative errors of radiance larger than this are cut off: they are none of gloss.
 _OUTLIER = 2.0
 
-#: Variance of a coefficient that is expected, over that of the noise of a ray.
-_RIDGE = 1e-3
+#: What may hold the coefficients at 0, over what images tell of one in the mean.
+_RIDGES = np.geomspace(1e-3, 100, 11)
 
 
 @dataclass(frozen=True)
@@ -61,33 +61,64 @@ class Mirrored:
                 total[channel] += value * dr.opaque(mi.Float, float(self.coefficients[channel, index]))
         return dr.maximum(mi.Color3f(*total), _LEAST)
 
-    def improved(self, samples: list[tuple[mi.Vector3f, mi.Color3f, mi.Color3f]]) -> Mirrored:
+    def improved(
+        self, direction: mi.Vector3f, radiance: mi.Color3f, color: mi.Color3f, view: mi.UInt32
+    ) -> Mirrored:
         """The factor that explains images best if the surface has given colours.
 
+        Coefficients are held at 0 as much as suits views that did not tell them: rays of one view err alike,
+        so few views tell little, however many rays they have.
+
         Args:
-            samples: of rays, the mirrored directions, the radiance in the images, and the colours. Without
-                any, nothing changes.
+            direction: unit directions into which rays are mirrored.
+            radiance: in the images.
+            color: of the surface.
+            view: index of the view that a ray is of.
         """
-        left, right = np.zeros((3, _COUNT, _COUNT)), np.zeros((3, _COUNT))
-        for direction, radiance, color in samples:
-            basis = np.stack([value.numpy() for value in _harmonics(direction)])
-            explained = (color * self.factor(direction)).numpy()
-            for channel, (seen, own, now) in enumerate(
-                zip(radiance.numpy(), color.numpy(), explained, strict=True)
-            ):
-                scale = 1 / np.maximum(own, max(DARK * own.mean(), 1e-9))
-                slope = basis * (own * scale)
-                left[channel] += slope @ slope.T
-                right[channel] += slope @ np.clip((seen - now) * scale, -_OUTLIER, _OUTLIER)
-        ridge = _RIDGE * np.trace(left, axis1=1, axis2=2)[:, None, None] / _COUNT + 1e-9
-        change = np.linalg.solve(left + ridge * np.eye(_COUNT), right[..., None])[..., 0]
-        return Mirrored(self.coefficients + change)
+        explained, basis, of_ray = (color * self.factor(direction)).numpy(), _basis(direction), view.numpy()
+        order = np.argsort(of_ray, kind="stable")
+        ends = np.flatnonzero(np.diff(of_ray[order])) + 1
+        found = np.zeros_like(self.coefficients)
+        for channel, (seen, own, now) in enumerate(
+            zip(radiance.numpy(), color.numpy(), explained, strict=True)
+        ):
+            scale = 1 / np.maximum(own, max(DARK * own.mean(), 1e-9))
+            slope = (basis * (own * scale))[:, order]
+            change = np.clip((seen - now) * scale, -_OUTLIER, _OUTLIER)[order]
+            values = change + self.coefficients[channel] @ slope
+            by_view = list(zip(np.split(slope, ends, axis=1), np.split(values, ends), strict=True))
+            left = np.array([part @ part.T for part, _ in by_view], np.float64)
+            right = np.array([part @ value for part, value in by_view], np.float64)
+            found[channel] = _held(left, right)
+        return Mirrored(found)
+
+
+def _held(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """(K,) solution of normal equations, with the ridge that foretells best what is left out.
+
+    Args:
+        left, right: (V, K, K) and (V, K), what each view adds to them.
+    """
+    total, count = left.sum(axis=0), len(right)
+    unit = np.trace(total) / len(total) * np.eye(len(total)) + 1e-9 * np.eye(len(total))
+    if count < 2:
+        return np.linalg.solve(total + _RIDGES[-1] * unit, right.sum(axis=0))
+    errors = []
+    for ridge in _RIDGES:
+        others = np.linalg.solve(total - left + ridge * unit, (right.sum(axis=0) - right)[..., None])[..., 0]
+        errors.append(np.einsum("vi,vij,vj->", others, left, others) - 2 * np.sum(others * right))
+    return np.linalg.solve(total + _RIDGES[np.argmin(errors)] * unit, right.sum(axis=0))
 
 
 def mirrored_direction(direction: mi.Vector3f, normal: mi.Vector3f) -> mi.Vector3f:
     """Where a ray along a unit ``direction`` is mirrored to, at normals of any length and sign."""
     normal = normal / dr.maximum(dr.norm(normal), 1e-12)
     return direction - 2 * dr.dot(direction, normal) * normal
+
+
+def _basis(direction: mi.Vector3f) -> np.ndarray:
+    """(48, n) harmonics of directions."""
+    return np.stack([value.numpy() for value in _harmonics(direction)])
 
 
 def _harmonics(direction: mi.Vector3f) -> list[mi.Float]:

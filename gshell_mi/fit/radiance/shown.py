@@ -240,7 +240,7 @@ class Shown:
         for _ in range(_ROUNDS):
             colors = self._mean_colors([(rays.met, rays.pixel.radiance)], mirrored)
             mirrored = mirrored.improved(
-                [(some.met.mirrored, some.pixel.radiance, some.met.interpolate(colors))]
+                some.met.mirrored, some.pixel.radiance, some.met.interpolate(colors), some.pixel.view
             )
         return mirrored
 

@@ -16,7 +16,8 @@ from gshell_mi.targets import Target
 from gshell_mi.triangles import positive_part
 from gshell_mi.views import PinholeViews
 
-COEFFICIENTS = 0.3 * np.random.default_rng(0).uniform(-1, 1, (3, 24)) / np.repeat([1, 2, 3, 4], [3, 5, 7, 9])
+_DEGREES = np.arange(1, 7)
+COEFFICIENTS = 0.3 * np.random.default_rng(0).uniform(-1, 1, (3, 48)) / np.repeat(_DEGREES, 2 * _DEGREES + 1)
 
 
 def _directions(count: int, seed: int) -> mi.Vector3f:
@@ -34,10 +35,14 @@ def test_a_ray_is_mirrored_at_either_side():
         np.testing.assert_allclose(mirrored, [0.6, 0.8, 0], atol=1e-6)
 
 
+def _views(count: int, seed: int) -> mi.UInt32:
+    return mi.UInt32(np.random.default_rng(seed).integers(0, 20, count).astype(np.uint32))
+
+
 def test_it_is_found_from_rays():
     truth, direction = Mirrored(COEFFICIENTS), _directions(20000, 1)
     color = mi.Color3f(np.random.default_rng(2).uniform(0.2, 0.8, (3, 20000)).astype(np.float32))
-    found = Mirrored.nothing().improved([(direction, color * truth.factor(direction), color)])
+    found = Mirrored.nothing().improved(direction, color * truth.factor(direction), color, _views(20000, 5))
     np.testing.assert_allclose(found.coefficients, COEFFICIENTS, atol=2e-3)
 
 
@@ -47,8 +52,29 @@ def test_colors_that_do_not_depend_on_the_direction_mirror_nothing():
         mi.Color3f(rng.uniform(low, high, (3, 20000)).astype(np.float32))
         for low, high in ((0.2, 0.8), (0.9, 1.1))
     )
-    found = Mirrored.nothing().improved([(_directions(20000, 4), color * noise, color)])
+    found = Mirrored.nothing().improved(_directions(20000, 4), color * noise, color, _views(20000, 5))
     assert np.abs(found.coefficients).max() < 0.01
+
+
+def test_what_one_view_tells_is_not_believed_of_others():
+    """Each view is brighter or darker as a whole, and looks into directions of its own."""
+    count, views, errors = 20000, 24, []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        view = rng.integers(0, views, count)
+        middle = rng.normal(size=(3, views))
+        middle /= np.linalg.norm(middle, axis=0)
+        direction = (middle[:, view] + 0.1 * rng.normal(size=(3, count))).astype(np.float32)
+        color = mi.Color3f(np.full((3, count), 0.5, np.float32))
+        bright = (1 + 0.3 * rng.normal(size=views)).astype(np.float32)
+        found = Mirrored.nothing().improved(
+            dr.normalize(mi.Vector3f(direction)),
+            color * mi.Float(bright[view]),
+            color,
+            mi.UInt32(view.astype(np.uint32)),
+        )
+        errors.append(np.sqrt(np.mean((found.factor(_directions(1000, 7)).numpy() - 1) ** 2)))
+    assert np.mean(errors) < 0.1
 
 
 # --- a glossy sphere: its highlights move over it as the camera does
