@@ -94,7 +94,8 @@ class Mirrored:
 
 
 def _held(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(K,) solution of normal equations, with the ridge that foretells best what is left out.
+    """(K,) solution of normal equations, with the largest ridge that foretells what is left out as well as
+    the best one, up to a standard error (Breiman and others 1984).
 
     Args:
         left, right: (V, K, K) and (V, K), what each view adds to them.
@@ -106,8 +107,10 @@ def _held(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     errors = []
     for ridge in _RIDGES:
         others = np.linalg.solve(total - left + ridge * unit, (right.sum(axis=0) - right)[..., None])[..., 0]
-        errors.append(np.einsum("vi,vij,vj->", others, left, others) - 2 * np.sum(others * right))
-    return np.linalg.solve(total + _RIDGES[np.argmin(errors)] * unit, right.sum(axis=0))
+        errors.append(np.einsum("vi,vij,vj->v", others, left, others) - 2 * (others * right).sum(axis=1))
+    worse = np.array(errors) - errors[np.argmin(np.sum(errors, axis=1))]
+    as_good = worse.mean(axis=1) <= worse.std(axis=1) / np.sqrt(count - 1)
+    return np.linalg.solve(total + _RIDGES[as_good].max() * unit, right.sum(axis=0))
 
 
 def mirrored_direction(direction: mi.Vector3f, normal: mi.Vector3f) -> mi.Vector3f:
