@@ -35,7 +35,6 @@ from gshell_mi.evaluation.mesh_scores import mesh_scores  # noqa: E402
 from gshell_mi.fit import FitConfig  # noqa: E402
 from gshell_mi.fit import stage as fit_stage  # noqa: E402
 from gshell_mi.fit.judge import Judge, Verdict, places_of  # noqa: E402
-from gshell_mi.fit.lattices import Lattices  # noqa: E402
 from gshell_mi.fit.pipeline import pipeline  # noqa: E402
 from gshell_mi.fit.poses.corrections import Corrections  # noqa: E402
 from gshell_mi.fit.stage import Fit  # noqa: E402
@@ -141,7 +140,7 @@ def fitted_openings(path: Path, config: FitConfig) -> tuple[list[Change], Surfac
         What the judge has decided on whole surfaces, and the surface after the openings stage.
     """
     scene, truth = load_fit_scene(path), trimesh.load(path.with_suffix("") / "truth.ply", process=False)
-    lattices, changes, surfaces = Lattices.of(scene.subject, config), [], {}
+    fit, changes, surfaces = Fit.of(scene, config), [], {}
     surface, stage = Surface(scene.subject.fields()), None
 
     class Recording(Judge):
@@ -163,8 +162,7 @@ def fitted_openings(path: Path, config: FitConfig) -> tuple[list[Change], Surfac
 
     given, fit_stage.Judge = fit_stage.Judge, Recording
     try:
-        fit = Fit(scene, config, lattices)
-        for stage in pipeline(scene, lattices, config):
+        for stage in pipeline(scene, fit.lattices, config):
             if stage.name == "joint":
                 break
             surface = stage.run(fit.corrected(surface), surface, Silent()).after(surface)
@@ -256,7 +254,7 @@ def decided_openings(path: Path, config: FitConfig, surface: Surface) -> list[di
     scene, truth = load_fit_scene(path), trimesh.load(path.with_suffix("") / "truth.ply", process=False)
     if topology(np.asarray(truth.vertices), np.asarray(truth.faces)).boundary_loops == 0:
         return []
-    fit = Fit(scene, config, Lattices.of(scene.subject, config))
+    fit = Fit.of(scene, config)
     template, cell = template_of(scene.subject, surface), fit.cell(surface)
     mesh = vertices, faces = template.closed
     opened = clean_opacity(template.logits, vertices, faces, config.topology.min_area) <= 0

@@ -31,7 +31,6 @@ def joint_stage(scene: Path, output: Path):
     from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
     from gshell_mi.fit.fitted import Fitted
     from gshell_mi.fit.joint.joint import JointStage
-    from gshell_mi.fit.lattices import Lattices
     from gshell_mi.fit.stage import Fit
     from gshell_mi.fit.surface import Surface
     from gshell_mi.scene import load_fit_scene
@@ -39,9 +38,10 @@ def joint_stage(scene: Path, output: Path):
     loaded = load_fit_scene(scene)
     checkpoint = Checkpoint.load(output / "checkpoint.npz")
     config = FitConfig().changed(checkpoint.config)
-    fit = Fit(loaded, config, Lattices.of(loaded.subject, config))
-    fitted = Fitted.of(fit, Surface.from_arrays(checkpoint.arrays))
-    return JointStage(loaded, fitted.material, fitted.light, config)
+    surface = Surface.from_arrays(checkpoint.arrays)
+    fit = Fit.of(loaded, config).corrected(surface)
+    fitted = Fitted.of(fit, surface)
+    return JointStage(fit.scene, fitted.material, fitted.light, config, turns=fit.views.turns)
 
 
 def seconds_per_phase(

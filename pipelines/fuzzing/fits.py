@@ -223,7 +223,6 @@ def judge_views(folder: Path) -> None:
     from silent_steps import Silent
 
     from gshell_mi.fit.config import FitConfig
-    from gshell_mi.fit.lattices import Lattices
     from gshell_mi.fit.stage import Fit
     from gshell_mi.fit.stages.exposures import Exposures
     from gshell_mi.fit.stages.hull import Hull
@@ -242,7 +241,7 @@ def judge_views(folder: Path) -> None:
         }
     )
     scene = load_fit_scene(folder / "bowl.xml")
-    given = Fit(scene, config, Lattices.of(scene.subject, config))
+    given = Fit.of(scene, config)
     surface = Surface(scene.subject.fields())
     for stage in (
         Occlusion(config.occlusion),

@@ -6,12 +6,11 @@ import pytest
 def exact(bowl_scene):
     """What the stages of a fit of the bowl may read, with the default settings."""
     from gshell_mi.fit import FitConfig
-    from gshell_mi.fit.lattices import Lattices
     from gshell_mi.fit.stage import Fit
     from gshell_mi.scene import load_fit_scene
 
     scene, config = load_fit_scene(bowl_scene), FitConfig()
-    return Fit(scene, config, Lattices.of(scene.subject, config))
+    return Fit.of(scene, config)
 
 
 @pytest.fixture

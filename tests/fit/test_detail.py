@@ -13,7 +13,6 @@ from gshell_mi.fields import LatticeFields, sphere
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.joint.joint import JointStage
-from gshell_mi.fit.lattices import Lattices
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.joint import (
     DetailConfig,
@@ -158,4 +157,4 @@ def _ball_in_blocks(bowl_scene, settings):
     count = lattice.vertex_count
     seen = Seen(np.full((count, 3), 0.5), np.full(count, True), np.float32(1))
     surface = Surface(sphere(lattice, RADIUS).in_blocks(), seen=seen)
-    return Fit(scene, config, Lattices.of(scene.subject, config)), surface
+    return Fit.of(scene, config), surface
