@@ -137,8 +137,10 @@ def test_metrics_say_whether_the_refinement_was_kept(bowl_scene, tmp_path, decis
 
 
 def test_log_has_a_line_per_step(whole):
-    counts = {"openings": 100, "cavities": 10, "refinement": 8, "joint": 12, "revision": 100}
-    assert steps(whole) == [(stage, i) for stage, count in counts.items() for i in range(count)]
+    # What the judge does not accept at once, it is asked again, after as many steps.
+    rounds = sum(stage == "openings" for stage, _ in steps(whole)) // 100
+    counts = {"openings": 100 * rounds, "cavities": 10, "refinement": 8, "joint": 12, "revision": 100}
+    assert rounds and steps(whole) == [(stage, i) for stage, count in counts.items() for i in range(count)]
     losses = [json.loads(line)["image"] for line in (whole / "log.jsonl").read_text().splitlines()]
     assert np.mean(losses[90:100]) < 0.8 * np.mean(losses[:10]), "the openings stage learns"
 
