@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from ..extraction import SurfaceMesh
     from ..light import EnvironmentLight
     from ..material import GivenMaterial, MaterialField
-    from ..scene import FitScene
+    from ..scene import FitScene, View
 
 
 def export_fit(
@@ -42,6 +43,7 @@ def export_fit(
     *,
     light_turns: bool = False,
     gains: np.ndarray | None = None,
+    laid: Sequence[View] = (),
 ) -> dict:
     """Writes meshes, light, scene and pictures of the views.
 
@@ -54,6 +56,7 @@ def export_fit(
         light_turns: whether the light turns with the camera: then it is stored as the first view has it.
         gains: (N, 3) that each view's channels are multiplied by, as its target was exposed so; None if all
             were exposed alike.
+        laid: the held-out views with corrected cameras, which are scored besides; none if as given.
 
     Returns:
         The metrics, which ``write_metrics`` stores.
@@ -71,20 +74,22 @@ def export_fit(
     _write_surface(output / "template.ply", template, {"vertex_msdf": template.to_numpy()[2]})
     write_light(output / "light.exr", given.light, light)
     write_scene(output / "scene.xml", given.light, given.sensors)
-    scores = {}
-    for folder, group in shown.items():
-        if group:
-            # The first training view has the light as it is stored.
-            turns = turns_with_camera([given.sensors[0], *(view.sensor for view in group)])[1:]
-            lights = [light.turned(turn) for turn in turns] if light and light_turns else []
-            exposed = gains[chosen] if folder == TRAINING and gains is not None else ()
-            scores[folder] = write_views(output, folder, group, lights, exposed)
+
+    def scored(folder: str | None, group: Sequence[View]) -> dict:
+        # The first training view has the light as it is stored.
+        turns = turns_with_camera([given.sensors[0], *(view.sensor for view in group)])[1:]
+        lights = [light.turned(turn) for turn in turns] if light and light_turns else []
+        exposed = gains[chosen] if folder == TRAINING and gains is not None else ()
+        return write_views(output, folder, group, lights, exposed)
+
+    scores = {folder: scored(folder, group) for folder, group in shown.items() if group}
     return {
         "scene": given.path.name,
         "targets": str(given.targets[0].path.parent.absolute()),
         "psnr_training": scores[TRAINING]["mean"]["psnr"],
         "training": scores[TRAINING],
         **({"held_out": scores[HELD_OUT]} if given.held_out else {}),
+        **({"held_out_laid": scored(None, laid)} if laid else {}),
         **({} if gains is None else {"exposures": _exposures(given, gains)}),
         "counts": dataclasses.asdict(topology(vertices, faces)),
         "versions": {

@@ -36,16 +36,16 @@ def view_files(training: Iterable[str], held_out: Iterable[str]) -> list[str]:
 
 def write_views(
     output: Path,
-    folder: str,
+    folder: str | None,
     views: Sequence[View],
     lights: Sequence[mi.Transform4f],
     gains: Sequence[np.ndarray] | np.ndarray = (),
 ) -> dict:
-    """Renders the exported scene; writes a triptych per view and, if its target has alpha, the masks.
+    """Scores renders of the exported scene; writes triptychs, and masks of views whose targets have alpha.
 
     Args:
         output: the fit's folder, with ``scene.xml``.
-        folder: in it, for the triptychs.
+        folder: in it, for the triptychs; None writes no pictures.
         views: one or more.
         lights: per view ``to_world`` of the light, if it turns with the camera.
         gains: per view what its three channels are multiplied by, as its target was exposed so; none if all
@@ -54,7 +54,8 @@ def write_views(
     Returns:
         ``views``, the scores by view, and ``mean``, rounded: an entry of ``metrics.json``.
     """
-    (output / folder).mkdir(exist_ok=True)
+    if folder:
+        (output / folder).mkdir(exist_ok=True)
     scene = load_scene(output / "scene.xml")
     integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": True})
     scores, parameters = dict[str, Scores](), mi.traverse(scene)
@@ -67,8 +68,9 @@ def write_views(
             image[..., :3] *= gains[index]
         name, target = view.sensor.id(), view.target
         scores[name] = view_scores(image, target)
-        write_png(output / folder / f"{name}.png", triptych(target.rgba, image))
-        if target.has_alpha:
+        if folder:
+            write_png(output / folder / f"{name}.png", triptych(target.rgba, image))
+        if folder and target.has_alpha:
             (output / MASKS).mkdir(exist_ok=True)
             overlay = mask_overlay(target.rgba[..., 3], image[..., 3], np.asarray(target.known) > 0.5)
             write_png(output / MASKS / f"{name}.png", overlay)

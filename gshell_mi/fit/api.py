@@ -29,6 +29,7 @@ from .joint.depth import check_depth
 from .lattices import Lattices
 from .memory import MemoryEstimate
 from .pipeline import pipeline
+from .poses.held_out import held_out_views
 from .runner import Runner, checkpoint_path
 from .scene_checks import check_given, check_names
 from .stage import Fit
@@ -194,6 +195,7 @@ def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report:
             fitted.texture_levels,
             light_turns=fit.light_turns,
             gains=surface.gains,
+            laid=held_out_views(fit, surface),
         )
         metrics["light_frame"] = "camera" if fit.light_turns else "world"
         metrics["config"] = dataclasses.asdict(fit.config)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from .bounds import Between, check_bounds, leaves
 from .joint.config import LossConfig, ModelConfig, RenderConfig
+from .poses.laying import CamerasConfig
 from .radiance.config import VolumeConfig
 from .radiance.surface_radiance import RadianceConfig
 from .stages.cavities import CavitiesConfig
@@ -17,7 +18,6 @@ from .stages.hull import HullConfig
 from .stages.joint import DetailConfig, JointConfig
 from .stages.occlusion import OcclusionConfig
 from .stages.openings import OpeningsConfig
-from .stages.poses import CamerasConfig
 from .stages.refinement import FoldsConfig, RefinementConfig
 from .stages.texture import TextureConfig
 

@@ -56,13 +56,15 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
         start.append(Volume(config.volume))  # another start, if it is better
     # Networks are not tied to a lattice: theirs is the last one from the start.
     explicit = parametrisation_named(config.model.field).is_explicit
+    refined = config.poses == "refine"
     revises = config.openings.revise and not (given or config.watertight)
     if config.iterations and config.detail.iterations and explicit:
         start += [
             Joint("joint", config.joint, config.iterations, lattices.late),  # shape, material and light
-            *([Poses(config.cameras)] if config.poses == "refine" else []),  # corrects the cameras
+            *([Poses("poses", config.cameras)] if refined else []),  # corrects the cameras
             *([Revision(config.openings)] if revises else []),  # what is open after all
             Joint("detail", config.detail, config.detail.iterations),  # the same on the last lattice
+            *([Poses("late_poses", config.cameras)] if refined else []),  # further, by what is better now
         ]
     else:
         start.append(Joint("joint", config.joint, config.iterations, lattices.last))

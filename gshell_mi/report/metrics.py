@@ -25,6 +25,7 @@ _OPTIONAL = {
     "warnings": list,
     "diagnostics": dict,
     "held_out": dict,
+    "held_out_laid": dict,
     "exposures": dict,
     "poses": dict,
     "light_frame": str,
@@ -68,7 +69,7 @@ def _problem(metrics: object) -> str | None:
         for key in keys:
             if not _is_number(metrics[name].get(key)):
                 return f"'{name}.{key}' is no number"
-    for name in ("training", "held_out"):
+    for name in ("training", "held_out", "held_out_laid"):
         if name in metrics and not _are_scores(metrics[name]):
             return f"'{name}' holds no scores of views"
     if not _are_corrections(metrics):

@@ -114,6 +114,7 @@ def _write(folder: Path, metrics: dict, config: ReportConfig) -> Path:
         training_rows=score_rows(metrics["training"]),
         held_out=held_out_pictures(folder, metrics),
         held_out_rows=score_rows(metrics["held_out"]) if "held_out" in metrics else [],
+        laid_rows=score_rows(metrics["held_out_laid"]) if "held_out_laid" in metrics else [],
         corrections=correction_rows(metrics),
         correction_headings=CORRECTION_HEADINGS,
         masks=mask_pictures(folder, metrics),

@@ -27,7 +27,7 @@ from gshell_mi.lattice import TetLattice
 from gshell_mi.light import EnvironmentLight, turns_with_camera
 from gshell_mi.material import MaterialField
 from gshell_mi.own_folder import MARK, OwnFolder
-from gshell_mi.scene import load_fit_scene
+from gshell_mi.scene import View, load_fit_scene
 
 LATTICE = TetLattice(16)
 
@@ -282,6 +282,22 @@ def test_scores_are_those_of_the_pictures(exported, entry, names):
     for score in VIEW_SCORES:
         mean = np.mean([found[score] for found in scores["views"].values()])
         assert scores["mean"][score] == pytest.approx(mean, abs=1e-4)
+
+
+def test_corrected_cameras_are_scored_without_pictures(exported, tmp_path):
+    views = exported.fit.held_out
+    moved = [View(views[1].sensor, views[0].target), View(views[0].sensor, views[1].target)]
+    pictures = {}
+    for name, laid in (("given", ()), ("same", views), ("moved", moved)):
+        output = tmp_path / name
+        output.mkdir()
+        found = export_fit(output, exported.fit, exported.joint.material, exported.joint.light, 1, laid=laid)
+        pictures[name] = {path.name: path.read_bytes() for path in sorted(output.rglob("*.png"))}
+        if name == "given":
+            assert "held_out_laid" not in found
+        else:
+            assert (found["held_out_laid"] == found["held_out"]) == (name == "same")
+    assert pictures["given"] == pictures["same"] == pictures["moved"]
 
 
 def test_the_light_turns_with_held_out_cameras_too(exported, tmp_path, monkeypatch):

@@ -133,6 +133,18 @@ def test_held_out_views_come_worst_first(folder):
     assert rows == [("mean", "31.25", "30.00"), ("view_001", "31.00", "–"), ("view_000", "31.50", "30.00")]
 
 
+def test_held_out_views_with_corrected_cameras_come_besides(folder, tmp_path):
+    assert "laid on the surface" not in (folder / "report.html").read_text()
+    shutil.copytree(folder, tmp_path / "fit")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    views = {"view_003": {"psnr": 30.0}, "view_004": {"psnr": 33.0}}
+    metrics["held_out_laid"] = {"views": views, "mean": {"psnr": 31.5}}
+    (tmp_path / "fit" / "metrics.json").write_text(json.dumps(metrics))
+    page = write_report(tmp_path / "fit", SMALL).read_text().partition("laid on the surface")[2]
+    rows = re.findall(r"<td>(view_\d+|mean)</td><td>([^<]*)</td>", page.partition("</table>")[0])
+    assert rows == [("mean", "31.50"), ("view_003", "30.00"), ("view_004", "33.00")]
+
+
 def test_masks_come_worst_first_and_small(folder):
     page = (folder / "report.html").read_text().partition('<script type="module">')[0]
     masks = page.partition("<h2>Masks</h2>")[2].partition("<h2>Curves</h2>")[0]
@@ -199,6 +211,7 @@ def test_metrics_of_a_fit_are_read(tmp_path):
                 ({"training": {}}, "'training' holds"),
                 ({"training": TRAINING | {"mean": 5}}, "'training' holds"),
                 ({"held_out": 5}, "'held_out' is no dict"),
+                ({"held_out_laid": {"views": {}}}, "'held_out_laid' holds"),
                 ({"poses": {"views": {"view_000": {"pixels": "many"}}}}, "'poses' or 'exposures' holds"),
                 ({"poses": {"views": [1]}}, "'poses' or 'exposures' holds"),
                 ({"exposures": {"stops": {"view_000": None}}}, "'poses' or 'exposures' holds"),

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
+from scipy.linalg import block_diag
 
 from ...views import PinholeViews
 from ..judge import Verdict, verdict_of
@@ -21,11 +23,21 @@ _SQUARE = 24
 #: Residuals beyond so many times their median are taken for those of something else.
 _OUTLIER = 1.5
 
+#: Degrees of freedom of the corrections, of Student's t: as of Cauchy's. Most cameras are off by about as
+#: much, a few, such as the last ones of a tour around an object, by many times that.
+_FREEDOM = 1
+
 #: Rounds in which the spread of the corrections is found.
-_EMPIRICAL_BAYES = 20
+_EMPIRICAL_BAYES = 10
 
 #: Median of chi squared with six degrees of freedom.
 _CHI2_MEDIAN = 5.348
+
+#: Places that are looked at together: for memory.
+_ROWS = 4096
+
+#: Weight below which there is none.
+_LEAST = 1e-9
 
 #: Step, in radians or parts of the distance, that tells the derivatives of what is seen.
 _STEP = 1e-4
@@ -33,84 +45,96 @@ _STEP = 1e-4
 
 @dataclass(frozen=True)
 class _Normal:
-    """Normal equations of N views, of two halves of each image: of the six numbers of a correction.
+    """Normal equations of N views, of one kind of evidence, of the six numbers of each correction.
 
     Attributes:
-        matrix: (N, 2, 6, 6).
+        matrix: (N, 2, 6, 6) of two halves of each image, as if other views were right.
         right: (N, 2, 6).
+        joint: (6 N, 6 N) of all views at once.
+        joint_right: (6 N,).
         variance: of a residual.
     """
 
     matrix: np.ndarray
     right: np.ndarray
+    joint: np.ndarray
+    joint_right: np.ndarray
     variance: float
 
 
 class Alignment:
-    """Finds corrections by Gauss-Newton steps (Lucas and Kanade 1981), each view for itself.
+    """Finds corrections of all views at once by Gauss-Newton steps (Lucas and Kanade 1981).
 
-    How far to go is told by the views together. Two halves of each image tell how much of a step is noise;
-    what the steps vary by beyond that is how wrong cameras are, and each is corrected as far as its own
-    evidence is better than that (empirical Bayes; James and Stein 1961). So exact cameras stay.
+    What a place looks like is not known either, and is eliminated, as points are in bundle adjustment (Triggs
+    et al. 2000); the surface stays where it is. How far to go is told by the views together. Two halves of
+    each image tell how much of a step is noise; what the steps vary by beyond that is how wrong cameras are,
+    and each is corrected as far as its own evidence is better than that (empirical Bayes; James and Stein
+    1961). So exact cameras stay, while a few may be far more wrong than the others (Student's t, by
+    expectation maximisation; Lange et al. 1989).
 
     Args:
-        views: as given.
+        given: cameras.
         distance: from the cameras to the object, about; the unit of shifts.
+
+    Attributes:
+        views: corrected so far, as they are to the surface.
     """
 
-    def __init__(self, views: PinholeViews, distance: float):
-        self.given, self._distance = views, distance
-        self.corrections = Corrections(np.zeros((len(views), 3)), np.zeros((len(views), 3)))
+    def __init__(self, given: PinholeViews, distance: float):
+        self._given, self._distance, self.views = given, distance, given
+        self._moved = np.zeros((len(given), 6))
         self._spread = np.full(6, _FIRST_GUESS**2)
+        self._precision = np.ones(len(given))
         self._noise: dict[int, float] = {}
 
     @property
-    def views(self) -> PinholeViews:
-        """Corrected so far."""
-        return self.corrections.views(self.given)
+    def found(self) -> Corrections:
+        """So far: of cameras as they are to the surface."""
+        return Corrections.from_array(self._moved * np.repeat([1.0, self._distance], 3))
+
+    @property
+    def corrections(self) -> Corrections:
+        """The same but for what all have in common."""
+        return self.found.as_given(self._given)
 
     def step(self, kinds: Sequence[Sequence[Evidence]]) -> None:
         """One step, by one evidence or more of all views."""
-        views = self.views
-        now = self.corrections.to_array() / self._units
-        information, pull = np.zeros((len(views), 6, 6)), np.zeros((len(views), 6))
+        count, now = len(self._given), self._moved
+        information, pull = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
         for kind, evidence in enumerate(kinds):
-            normal = self._normal(evidence, views)
+            normal = self._normal(evidence)
             noise = normal.variance * self._excess(kind, normal, now)
-            information += normal.matrix.sum(axis=1) / noise
-            pull += normal.right.sum(axis=1) / noise
-        pull += np.einsum("nij,nj->ni", information, now)
+            information += normal.joint / noise
+            pull += normal.joint_right / noise
+        pull += information @ now.ravel()
         for _ in range(_EMPIRICAL_BAYES):
-            posterior = np.linalg.inv(information + np.diag(1 / self._spread))
-            mean = np.einsum("nij,nj->ni", posterior, pull)
-            squares = (mean**2).mean(axis=0) + np.einsum("nii->ni", posterior).mean(axis=0)
+            prior = (self._precision[:, None] / self._spread).ravel()
+            posterior = np.linalg.inv(information + np.diag(prior))
+            self._moved = (posterior @ pull).reshape(count, 6)
+            squares = self._moved**2 + posterior.diagonal().reshape(count, 6)
+            self._precision = (_FREEDOM + 6) / (_FREEDOM + (squares / self._spread).sum(axis=1))
             # One spread of rotations and one of shifts, whatever the direction.
-            self._spread = np.maximum(squares.reshape(2, 3).mean(axis=1).repeat(3), 1e-12)
-        self.corrections = Corrections.from_array(mean * self._units).as_given(self.given)
+            spread = (self._precision[:, None] * squares).mean(axis=0)
+            self._spread = np.maximum(spread.reshape(2, 3).mean(axis=1).repeat(3), 1e-12)
+        self.views = self.found.views(self._given)
 
     def verdict(self, kinds: Sequence[Sequence[Evidence]]) -> Verdict:
         """Whether steps are worth it: what one half of each image asks for has to explain the other half."""
-        views, count = self.views, len(self.given)
-        rays, before, after = (np.zeros(count) for _ in range(3))
+        rays, before, after = (np.zeros(len(self._given)) for _ in range(3))
         for evidence in kinds:
-            normal = self._normal(evidence, views)
+            normal = self._normal(evidence)
             prior = normal.variance * np.diag(1 / self._spread)
             steps = np.linalg.solve(normal.matrix + prior, normal.right[..., None])[..., 0]
-            for view, each in enumerate(evidence):
-                jacobian, half = self._jacobian(each, views, view), _half(each)
-                left = each.residuals + (jacobian * steps[view, 1 - half]).sum(axis=1)
-                for total, residual in ((before, each.residuals), (after, left)):
+            for view, (each, residuals) in enumerate(zip(evidence, _residuals(evidence), strict=True)):
+                left = residuals + (self._jacobian(each, view) * steps[view, 1 - _half(each)]).sum(axis=1)
+                for total, residual in ((before, residuals), (after, left)):
                     total[view] += (each.weights * np.abs(residual)).sum() / np.sqrt(normal.variance)
                 rays[view] += each.weights.sum()
         return verdict_of(rays[None], before[None], after[None])
 
-    @property
-    def _units(self) -> np.ndarray:
-        return np.repeat([1.0, self._distance], 3)
-
-    def _jacobian(self, evidence: Evidence, views: PinholeViews, view: int) -> np.ndarray:
-        """(K, 6) derivatives of the residuals, in radians and parts of the distance."""
-        offsets = evidence.offsets
+    def _jacobian(self, evidence: Evidence, view: int) -> np.ndarray:
+        """(K, 6) derivatives of the values, in radians and parts of the distance."""
+        offsets, views = evidence.offsets, self.views
         # What a camera turns away from goes round the other way in its image.
         moves = [-np.cross(axis, offsets) for axis in np.eye(3)]
         moves += [np.broadcast_to(-self._distance * axis, offsets.shape) for axis in np.eye(3)]
@@ -121,20 +145,28 @@ class Alignment:
         ]
         return np.stack([(evidence.slopes * each).sum(axis=1) for each in flow], axis=1)
 
-    def _normal(self, evidence: Sequence[Evidence], views: PinholeViews) -> _Normal:
-        everything = np.concatenate([np.abs(each.residuals) for each in evidence])
+    def _normal(self, evidence: Sequence[Evidence]) -> _Normal:
+        count, residuals = len(evidence), _residuals(evidence)
+        everything = np.abs(np.concatenate(residuals))
         scale = max(_OUTLIER * float(np.median(everything)) if len(everything) else 1.0, 1e-6)
-        matrix, right = np.zeros((len(views), 2, 6, 6)), np.zeros((len(views), 2, 6))
-        for view, each in enumerate(evidence):
-            jacobian, half = self._jacobian(each, views, view), _half(each)
-            # Cauchy's weights.
-            weight = each.weights / (1 + (each.residuals / scale) ** 2)
+        jacobians = [self._jacobian(each, view) for view, each in enumerate(evidence)]
+        # Cauchy's weights.
+        weights = [
+            each.weights / (1 + (residual / scale) ** 2)
+            for each, residual in zip(evidence, residuals, strict=True)
+        ]
+        matrix, right = np.zeros((count, 2, 6, 6)), np.zeros((count, 2, 6))
+        joint_right = np.zeros((count, 6))
+        about = _about_means(evidence, weights)
+        for view, (each, jacobian, weight) in enumerate(zip(evidence, jacobians, weights, strict=True)):
+            half, weighted = _half(each), jacobian * weight[:, None]
             for part in range(2):
                 chosen = half == part
-                weighted = jacobian[chosen] * weight[chosen, None]
-                matrix[view, part] = weighted.T @ jacobian[chosen]
-                right[view, part] = -weighted.T @ each.residuals[chosen]
-        return _Normal(matrix, right, scale**2)
+                matrix[view, part] = weighted[chosen].T @ jacobian[chosen]
+                right[view, part] = -weighted[chosen].T @ residuals[view][chosen]
+            joint_right[view] = -weighted.T @ about[view]
+        joint = block_diag(*matrix.sum(axis=1)) - _shared(evidence, jacobians, weights)
+        return _Normal(matrix, right, joint, joint_right.ravel(), scale**2)
 
     def _excess(self, kind: int, normal: _Normal, now: np.ndarray) -> float:
         """By how much the variance of a residual has to be larger for what two halves ask for to differ as it
@@ -152,6 +184,55 @@ class Alignment:
         ]
         self._noise[kind] = max(float(np.median(squares)) / _CHI2_MEDIAN, 1.0) if squares else 1.0
         return self._noise[kind]
+
+
+def _sums(evidence: Sequence[Evidence], values: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """For each view (K,) what (K,) values of all views come to at its places."""
+    where = np.concatenate([each.places for each in evidence])
+    total = np.bincount(where, np.concatenate(values))
+    return [total[each.places] for each in evidence]
+
+
+def _about_means(evidence: Sequence[Evidence], weights: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """For each view (K,) values less their means over all views, if they have places."""
+    if not evidence[0].shared:
+        return [each.values for each in evidence]
+    weighted = [weight * each.values for weight, each in zip(weights, evidence, strict=True)]
+    sums = zip(evidence, _sums(evidence, weighted), _sums(evidence, weights), strict=True)
+    return [each.values - total / np.maximum(weight, _LEAST) for each, total, weight in sums]
+
+
+def _residuals(evidence: Sequence[Evidence]) -> list[np.ndarray]:
+    """For each view (K,) values less the means over the other views, if they have places."""
+    own = [each.weights for each in evidence]
+    about = _about_means(evidence, own)
+    if not evidence[0].shared:
+        return about
+    return [
+        value * total / np.maximum(total - weight, _LEAST)
+        for value, total, weight in zip(about, _sums(evidence, own), own, strict=True)
+    ]
+
+
+def _shared(
+    evidence: Sequence[Evidence], jacobians: Sequence[np.ndarray], weights: Sequence[np.ndarray]
+) -> np.ndarray:
+    """(6 N, 6 N) by which views tell less together, as each of them helps to tell what a place looks like
+    (Schur's complement)."""
+    count = len(evidence)
+    result = np.zeros((6 * count, 6 * count))
+    if not evidence[0].shared:
+        return result
+    row = np.concatenate([each.places for each in evidence])
+    column = np.repeat(np.arange(count), [len(each.places) for each in evidence])
+    total = np.maximum(np.concatenate(_sums(evidence, weights)), _LEAST)
+    data = np.concatenate(jacobians) * (np.concatenate(weights) / np.sqrt(total))[:, None]
+    index = row.repeat(6), (6 * column[:, None] + np.arange(6)).ravel()
+    matrix = sparse.csr_array((data.ravel(), index), shape=(int(row.max(initial=-1)) + 1, 6 * count))
+    for start in range(0, matrix.shape[0], _ROWS):
+        rows = matrix[start : start + _ROWS].toarray()
+        result += rows.T @ rows
+    return result
 
 
 def _half(evidence: Evidence) -> np.ndarray:

@@ -32,6 +32,15 @@ class Corrections:
         """(N, 6): rotations and shifts."""
         return np.concatenate([self.rotations, self.shifts], axis=1)
 
+    def after(self, first: Corrections) -> Corrections:
+        """Both: these of cameras that others have corrected first."""
+        turns = Rotation.from_rotvec(self.rotations) * Rotation.from_rotvec(first.rotations)
+        return Corrections(turns.as_rotvec(), self.shifts + first.shifts)
+
+    def inverse(self) -> Corrections:
+        """Those that take these back."""
+        return Corrections(-self.rotations, -self.shifts)
+
     def views(self, given: PinholeViews) -> PinholeViews:
         """The given views, corrected."""
         turned = Rotation.from_rotvec(self.rotations).as_matrix() @ given.bases

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -38,20 +38,24 @@ class Evidence:
     Attributes:
         offsets: (K, 3) of what is seen, from the centre of projection, world units.
         pixels: (K, 2) where it is in the image.
-        slopes: (K, 2) how a residual changes with that.
-        residuals: (K,) which are 0 for a camera that is right.
+        slopes: (K, 2) how a value changes with that.
+        values: (K,) which all views have in common at a place if their cameras are right.
         weights: (K,) of these.
+        places: (K,) indices of places.
+        shared: whether what is right is known from the other views alone; else it is 0.
     """
 
     offsets: np.ndarray
     pixels: np.ndarray
     slopes: np.ndarray
-    residuals: np.ndarray
+    values: np.ndarray
     weights: np.ndarray
+    places: np.ndarray
+    shared: bool
 
 
 class Texture:
-    """Fine texture: each view shows a place as the mean of the other views does.
+    """Fine texture: a place looks the same in all views.
 
     Args:
         mesh: vertices (V, 3) and faces (F, 3), world units.
@@ -113,8 +117,7 @@ class Texture:
         seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
         views: PinholeViews,
     ) -> list[Evidence]:
-        places, found = 2 * len(self.points), []
-        total, weight, number = (np.zeros(places) for _ in range(3))
+        number, found = np.zeros(2 * len(self.points), int), []
         for view, (image, (index, place, cosine)) in enumerate(zip(images, seen, strict=True)):
             offset = self.points[index] - views.origins[view]
             pixel = projected(offset, views, view)
@@ -124,19 +127,11 @@ class Texture:
             offset, pixel, value, slope, place, cosine = (
                 array[good] for array in (offset, pixel, value, slope, place, cosine)
             )
-            total += np.bincount(place, cosine * value, places)
-            weight += np.bincount(place, cosine, places)
-            number += np.bincount(place, minlength=places)
-            found.append((offset, pixel, value, slope, place, cosine))
-        result = []
-        for offset, pixel, value, slope, place, cosine in found:
-            good = number[place] >= _VIEWS
-            offset, pixel, value, slope, place, cosine = (
-                array[good] for array in (offset, pixel, value, slope, place, cosine)
-            )
-            others = (total[place] - cosine * value) / (weight[place] - cosine)
-            result.append(Evidence(offset, pixel, slope, value - others, cosine))
-        return result
+            number += np.bincount(place, minlength=len(number))
+            found.append((offset, pixel, slope, value, cosine, place))
+        return [
+            Evidence(*(array[number[told[-1]] >= _VIEWS] for array in told), shared=True) for told in found
+        ]
 
 
 class Outline:
@@ -155,12 +150,9 @@ class Outline:
         """What the views tell."""
         found = [self._of_view(views, view) for view in range(len(views))]
         # A surface that is a little too thick everywhere says nothing of cameras.
-        everything = np.concatenate([each.residuals for each in found])
+        everything = np.concatenate([each.values for each in found])
         thick = float(np.median(everything)) if len(everything) else 0.0
-        return [
-            Evidence(each.offsets, each.pixels, each.slopes, each.residuals - thick, each.weights)
-            for each in found
-        ]
+        return [replace(each, values=each.values - thick) for each in found]
 
     def _of_view(self, views: PinholeViews, view: int) -> Evidence:
         width, height = (int(side) for side in views.sizes[view])
@@ -178,7 +170,8 @@ class Outline:
         # The outermost pixels are half a pixel inside.
         residual = value - 0.5
         good = (np.abs(residual) < _REACH) & np.isfinite(slope).all(axis=1)
-        return Evidence(offset[good], pixel[good], slope[good], residual[good], np.ones(int(good.sum())))
+        ones, places = np.ones(int(good.sum())), index[good]
+        return Evidence(offset[good], pixel[good], slope[good], residual[good], ones, places, shared=False)
 
 
 def _sampled(image: np.ndarray, pixel: np.ndarray) -> np.ndarray:

@@ -55,6 +55,15 @@ def test_sensors_are_where_the_views_are(kind):
     assert [one.film() for one in change.sensors(sensors)] == [one.film() for one in sensors]
 
 
+def test_corrections_follow_each_other_and_are_taken_back():
+    given = PinholeViews.from_sensors([sensor(index) for index in range(3)])
+    first, then = corrections(3), corrections(3, seed=2)
+    once, both = first.views(given), then.after(first).views(given)
+    for found, expected in ((both, then.views(once)), (first.inverse().views(once), given)):
+        np.testing.assert_allclose(found.origins, expected.origins, atol=1e-12)
+        np.testing.assert_allclose(found.bases, expected.bases, atol=1e-12)
+
+
 def test_a_similarity_of_all_cameras_is_no_correction():
     views = PinholeViews.from_sensors([sensor(index) for index in range(6)])
     turn, middle = Rotation.from_rotvec([0.1, -0.2, 0.05]), views.origins.mean(axis=0)
