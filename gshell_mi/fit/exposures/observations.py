@@ -68,6 +68,12 @@ class Observations:
         arrays = ("place", "view", "region", "log_radiance", "weight", "normal", "mirrored", "toward")
         return replace(self, **{name: getattr(self, name)[chosen] for name in arrays})
 
+    def turned(self, turns: np.ndarray) -> Observations:
+        """The same in a frame that turns with the views, by (N, 3, 3) rotations."""
+        axes = turns[self.view]
+        vectors = {name: getattr(self, name) for name in ("normal", "mirrored", "toward")}
+        return replace(self, **{name: np.einsum("ei,eij->ej", told, axes) for name, told in vectors.items()})
+
 
 def observe(
     mesh: tuple[np.ndarray, np.ndarray],
@@ -123,9 +129,6 @@ def observe(
         back = cosine[index] < 0
         normal = np.where(back[:, None], -normals[index], normals[index])
         toward = outwards[index]
-        directions = normal, 2 * np.abs(cosine[index])[:, None] * normal - toward, toward
-        if views.turns is not None:
-            directions = tuple(vectors @ views.turns[view] for vectors in directions)
         found.append(
             (
                 2 * index + back,
@@ -133,14 +136,17 @@ def observe(
                 region[index],
                 np.log(np.maximum(radiance, 1e-6)),
                 (radiance / (radiance + floor)) ** 2,
-                *directions,
+                normal,
+                2 * np.abs(cosine[index])[:, None] * normal - toward,
+                toward,
             )
         )
     if not found:
         return Observations(
             len(views), *(np.zeros(0, int) for _ in range(3)), *(np.zeros((0, 3)) for _ in range(5))
         )
-    return Observations(len(views), *(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
+    seen = Observations(len(views), *(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
+    return seen if views.turns is None else seen.turned(views.turns)
 
 
 def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

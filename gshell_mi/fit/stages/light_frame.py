@@ -38,19 +38,19 @@ class LightFrame:
         """The surface with what the light is fixed to."""
         with steps.task():
             mesh = fit.scene.subject.surface_of(surface.fields).to_numpy()[:2]
-            told = []
-            for turns in (None, turns_with_camera(fit.scene.sensors)):
-                seen = observe(
-                    mesh,
-                    replace(fit.views, turns=turns),
-                    fit.scene.targets,
-                    places=self.config.places,
-                    cell=fit.cell(surface),
-                    seed=fit.config.seed,
-                )
-                told.append(ColorModel(seen, self.config.prior * np.log(2)).foretold())
-            world, camera = told
+            seen = observe(
+                mesh,
+                fit.views,
+                fit.scene.targets,
+                places=self.config.places,
+                cell=fit.cell(surface),
+                seed=fit.config.seed,
+            )
+            turns = turns_with_camera(fit.scene.sensors)
+            world, camera = (
+                ColorModel(told, self.config.prior * np.log(2)).foretold()
+                for told in (seen, seen.turned(turns))
+            )
             verdict = verdict_of(world.rays[None], world.errors[None], camera.errors[None])
-        turns = bool(verdict.accepted[0])
         steps.fact("light_frame_verdict", verdict.facts())
-        return replace(surface, light_turns=np.array(True)) if turns else surface
+        return replace(surface, light_turns=np.array(True)) if verdict.accepted[0] else surface
