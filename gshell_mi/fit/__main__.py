@@ -108,7 +108,7 @@ def _fit(given: _Arguments) -> None:
     if "held_out" in result.metrics:
         print(f"held-out views: {scores_line(result.metrics['held_out'])}")
     if "held_out_laid" in result.metrics:
-        print(f"with their cameras corrected too: {scores_line(result.metrics['held_out_laid'])}")
+        print(f"the same, with cameras laid on the result: {scores_line(result.metrics['held_out_laid'])}")
 
 
 def _how_to_continue(given: _Arguments) -> str:

@@ -182,8 +182,10 @@ def _check_settings(before: dict[str, Any], now: dict[str, Any]) -> None:
 def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report: bool) -> dict:
     """Writes what a fit has found; returns the metrics."""
     output, progress, checkpoint = runner.output, runner.progress, runner.checkpoint
+    fit = fit.corrected(dataclasses.replace(surface, gains=None))
+    with progress.stage("held-out views", None), runner.timed("held_out"):
+        laid = held_out_views(fit, surface)
     with progress.stage("export", None), runner.timed("export"):
-        fit = fit.corrected(dataclasses.replace(surface, gains=None))
         fitted = Fitted.of(fit, surface)
         metrics = export_fit(
             output,
@@ -195,7 +197,7 @@ def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report:
             fitted.texture_levels,
             light_turns=fit.light_turns,
             gains=surface.gains,
-            laid=held_out_views(fit, surface),
+            laid=laid,
         )
         metrics["light_frame"] = "camera" if fit.light_turns else "world"
         metrics["config"] = dataclasses.asdict(fit.config)

@@ -26,7 +26,7 @@ _PER_WEIGHT = 20  # of FlexiCubes, if they are optimised: its gradient and Adam'
 _WEIGHTS_PER_SQUARE_CELL = 900  # ... where only blocks around the surface have some
 _PER_RAY = 300  # that a step of the stages up to the volume follows
 _PER_TEXEL = 100  # of the light: its values, gradient, Adam's moments and the table it is sampled by
-_PER_PLACE = 500  # of the surface that poses compare: where it is, and what each view sees there
+_PER_SIGHTING = 160  # of a place of the surface that poses compare, by one of all views: a third sees it
 _PER_SQUARE_VOXEL = 19_000  # of the radiance volume's side squared: a tablecloth fills 57 voxels each, of 340
 
 
@@ -94,7 +94,7 @@ class MemoryEstimate:
                 _PER_RAY * config.radiance.batch,
                 _PER_RAY * config.cavities.batch,
                 _PER_RAY * config.volume.batch,
-                _PER_PLACE * config.cameras.places,
+                _PER_SIGHTING * config.cameras.places * len(pixels),
             ),
             light=_PER_TEXEL * 2 * config.model.light_height**2,
         )

@@ -64,7 +64,9 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
             *([Poses("poses", config.cameras)] if refined else []),  # corrects the cameras
             *([Revision(config.openings)] if revises else []),  # what is open after all
             Joint("detail", config.detail, config.detail.iterations),  # the same on the last lattice
-            *([Poses("late_poses", config.cameras)] if refined else []),  # further, by what is better now
+            *(
+                [Poses("late_poses", config.cameras, last=True)] if refined else []
+            ),  # further, by what is better now
         ]
     else:
         start.append(Joint("joint", config.joint, config.iterations, lattices.last))

@@ -33,10 +33,10 @@ _EMPIRICAL_BAYES = 10
 #: Median of chi squared with six degrees of freedom.
 _CHI2_MEDIAN = 5.348
 
-#: Places that are looked at together: for memory.
+#: Places whose derivatives, 6 N numbers each, are in memory at once.
 _ROWS = 4096
 
-#: Weight below which there is none.
+#: Keeps sums of weights from being 0.
 _LEAST = 1e-9
 
 #: Step, in radians or parts of the distance, that tells the derivatives of what is seen.
@@ -73,15 +73,17 @@ class Alignment:
     expectation maximisation; Lange et al. 1989).
 
     Args:
-        given: cameras.
+        given: cameras, N.
         distance: from the cameras to the object, about; the unit of shifts.
+        moving: (N,) which may move; default: all.
 
     Attributes:
-        views: corrected so far, as they are to the surface.
+        views: corrected so far, where they lie on the surface.
     """
 
-    def __init__(self, given: PinholeViews, distance: float):
+    def __init__(self, given: PinholeViews, distance: float, moving: np.ndarray | None = None):
         self._given, self._distance, self.views = given, distance, given
+        self._moving = np.flatnonzero(np.ones(len(given), bool) if moving is None else moving)
         self._moved = np.zeros((len(given), 6))
         self._spread = np.full(6, _FIRST_GUESS**2)
         self._precision = np.ones(len(given))
@@ -89,33 +91,37 @@ class Alignment:
 
     @property
     def found(self) -> Corrections:
-        """So far: of cameras as they are to the surface."""
+        """So far, of cameras that lie on the surface."""
         return Corrections.from_array(self._moved * np.repeat([1.0, self._distance], 3))
 
     @property
     def corrections(self) -> Corrections:
-        """The same but for what all have in common."""
-        return self.found.as_given(self._given)
+        """The same without what all have in common, in which cameras that are far more wrong hardly count."""
+        return self.found.as_given(self._given, self._precision)
 
     def step(self, kinds: Sequence[Sequence[Evidence]]) -> None:
         """One step, by one evidence or more of all views."""
-        count, now = len(self._given), self._moved
+        count, now = len(self._given), self._moved.copy()
         information, pull = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
         for kind, evidence in enumerate(kinds):
             normal = self._normal(evidence)
             noise = normal.variance * self._excess(kind, normal, now)
             information += normal.joint / noise
             pull += normal.joint_right / noise
-        pull += information @ now.ravel()
+        moving = self._moving
+        free = (6 * moving[:, None] + np.arange(6)).ravel()
+        information = information[np.ix_(free, free)]
+        pull = pull[free] + information @ now[moving].ravel()
         for _ in range(_EMPIRICAL_BAYES):
-            prior = (self._precision[:, None] / self._spread).ravel()
+            prior = (self._precision[moving, None] / self._spread).ravel()
             posterior = np.linalg.inv(information + np.diag(prior))
-            self._moved = (posterior @ pull).reshape(count, 6)
-            squares = self._moved**2 + posterior.diagonal().reshape(count, 6)
-            self._precision = (_FREEDOM + 6) / (_FREEDOM + (squares / self._spread).sum(axis=1))
+            mean = (posterior @ pull).reshape(-1, 6)
+            squares = mean**2 + posterior.diagonal().reshape(-1, 6)
+            precision = (_FREEDOM + 6) / (_FREEDOM + (squares / self._spread).sum(axis=1))
             # One spread of rotations and one of shifts, whatever the direction.
-            spread = (self._precision[:, None] * squares).mean(axis=0)
+            spread = (precision[:, None] * squares).mean(axis=0)
             self._spread = np.maximum(spread.reshape(2, 3).mean(axis=1).repeat(3), 1e-12)
+            self._moved[moving], self._precision[moving] = mean, precision
         self.views = self.found.views(self._given)
 
     def verdict(self, kinds: Sequence[Sequence[Evidence]]) -> Verdict:

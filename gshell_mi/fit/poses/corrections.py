@@ -51,7 +51,7 @@ class Corrections:
         turns = Rotation.from_rotvec(self.rotations).as_matrix()
         return [_moved(*each) for each in zip(given, turns, self.shifts, strict=True)]
 
-    def as_given(self, views: PinholeViews) -> Corrections:
+    def as_given(self, views: PinholeViews, weight: np.ndarray | None = None) -> Corrections:
         """The same without what all cameras have in common.
 
         The scene could be turned, moved and scaled together with the cameras, and no image would change. So
@@ -59,30 +59,37 @@ class Corrections:
 
         Args:
             views: as given.
+            weight: (N,) how much each has to say in that; default: all the same.
         """
+        share = np.ones(len(views)) if weight is None else weight
+        share = (share / share.sum())[:, None]
         turns, moved = Rotation.from_rotvec(self.rotations), views.origins + self.shifts
-        a, b = moved - moved.mean(axis=0), views.origins - views.origins.mean(axis=0)
+        middle = (share * views.origins).sum(axis=0)
+        a, b = moved - (share * moved).sum(axis=0), views.origins - middle
         # Procrustes: orientations and places have the same say (Kabsch 1976).
-        size_a, size_b = (max(float(np.linalg.norm(each)), 1e-12) for each in (a, b))
-        u, _, vt = np.linalg.svd(b.T @ a / (size_a * size_b) + turns.as_matrix().mean(axis=0).T)
+        size_a, size_b = (max(float(np.sqrt((share * each**2).sum())), 1e-12) for each in (a, b))
+        mean_turn = (share[..., None] * turns.as_matrix()).sum(axis=0)
+        u, _, vt = np.linalg.svd((share * b).T @ a / (size_a * size_b) + mean_turn.T)
         turn = Rotation.from_matrix(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)
-        moved = size_b / size_a * turn.apply(a) + views.origins.mean(axis=0)
+        moved = size_b / size_a * turn.apply(a) + middle
         return Corrections((turn * turns).as_rotvec(), moved - views.origins)
 
     def in_pixels(self, views: PinholeViews, points: np.ndarray) -> np.ndarray:
-        """(N,) mean distances by which points (P, 3) move in the images.
+        """(N,) mean distances by which points (P, 3) move in the images; 0 where none is in the image.
 
         Args:
             views: as given.
             points: of the surface, world units.
         """
-        before, after = (
-            [projected(points - each.origins[view], each, view) for view in range(len(each))]
-            for each in (views, self.views(views))
-        )
-        return np.array(
-            [np.linalg.norm(there - here, axis=1).mean() for here, there in zip(before, after, strict=True)]
-        )
+        moved, found = self.views(views), np.zeros(len(views))
+        for view in range(len(views)):
+            here = projected(points - views.origins[view], views, view)
+            framed = ((here > -0.5) & (here < views.sizes[view] - 0.5)).all(axis=1)
+            framed &= (points - views.origins[view]) @ np.linalg.inv(views.bases[view])[2] > 0
+            if framed.any():
+                there = projected(points[framed] - moved.origins[view], moved, view)
+                found[view] = np.linalg.norm(there - here[framed], axis=1).mean()
+        return found
 
 
 def projected(offsets: np.ndarray, views: PinholeViews, view: int) -> np.ndarray:

@@ -42,6 +42,7 @@ class Laying:
         config: the settings.
         cell: side of a lattice cell, world units.
         seed: of the places that are compared.
+        moving: (N,) which cameras may move; default: all.
 
     Attributes:
         points: (P, 3) these places.
@@ -57,23 +58,24 @@ class Laying:
         *,
         cell: float,
         seed: int,
+        moving: np.ndarray | None = None,
     ):
         distance = float(np.linalg.norm(views.origins - mesh[0].mean(axis=0), axis=1).mean())
-        self.alignment = Alignment(views, distance)
+        self.alignment = Alignment(views, distance, moving)
         self._texture = Texture(mesh, targets, config.places, cell, seed)
         self._outline, self._config = Outline(mesh, targets), config
         self._verdict: Verdict | None = None
         self.points = self._texture.points
 
     def level(self, number: int, advance: Callable[[], object] = lambda: None) -> Verdict:
-        """The steps of a level, from 0 on.
+        """The steps of a level; levels come in their order.
 
         Args:
-            number: how often the blur is halved.
+            number: of the level, from 0 on: how often the blur is halved.
             advance: is told of each step.
 
         Returns:
-            Whether corrections are worth it, as the first step of all has told.
+            Whether corrections are worth it, as is told before the first step of the first level.
         """
         alignment, verdict = self.alignment, self._verdict
         texture = self._texture.level(self._config.blur / 2**number, alignment.views)

@@ -22,23 +22,30 @@ from ..surface import Surface
 
 
 class Poses:
-    """Corrects the cameras, if one half of each image foretells the other by that."""
+    """Corrects the cameras, if one half of each image foretells the other by that.
 
-    def __init__(self, name: str, config: CamerasConfig):
-        self.name, self.config = name, config
+    Args:
+        name: of the stage.
+        config: its settings.
+        last: whether the surface stays as it is. Then cameras have to lie on it; else, in the mean, they stay
+            where they are, and what all have in common is left to the surface.
+    """
+
+    def __init__(self, name: str, config: CamerasConfig, *, last: bool = False):
+        self.name, self.config, self._last = name, config, last
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface with corrections of the cameras, or as it was if they do not count."""
-        if not fit.pixels.has_alpha:
-            return surface
         config, mesh = self.config, fit.scene.subject.surface_of(surface.fields).to_numpy()[:2]
+        if not (fit.pixels.has_alpha and len(mesh[1])):
+            return surface
         with steps.task(total=config.levels * config.rounds) as advance:
             laying = Laying(
                 mesh, fit.views, fit.scene.targets, config, cell=fit.cell(surface), seed=fit.config.seed
             )
             for level in range(config.levels):
                 verdict = laying.level(level, advance)
-                corrections = laying.alignment.corrections
+                corrections = laying.alignment.found if self._last else laying.alignment.corrections
                 moved = float(np.sqrt((corrections.in_pixels(fit.views, laying.points) ** 2).mean()))
                 kept = bool(verdict.accepted[0]) and moved > config.least
                 if not kept:

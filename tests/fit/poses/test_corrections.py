@@ -64,6 +64,26 @@ def test_corrections_follow_each_other_and_are_taken_back():
         np.testing.assert_allclose(found.bases, expected.bases, atol=1e-12)
 
 
+def test_only_what_is_in_an_image_moves_there():
+    """A close-up has much behind it, and beside it."""
+    given = PinholeViews.from_sensors([sensor(index) for index in range(2)])
+    axis = given.bases[0] @ [0.5, 0.5, 1.0]
+    ahead, behind = given.origins[0] + 3 * axis, given.origins[0] - 1e-6 * axis
+    change = corrections(2, size=1e-3)
+    alone = change.in_pixels(given, ahead[None])[0]
+    assert 0 < alone < 1
+    assert change.in_pixels(given, np.stack([ahead, behind]))[0] == alone
+    assert change.in_pixels(given, behind[None])[0] == 0
+
+
+def test_who_has_no_say_is_no_part_of_what_all_have_in_common():
+    views = PinholeViews.from_sensors([sensor(index) for index in range(6)])
+    change = Corrections(np.zeros((6, 3)), np.zeros((6, 3)))
+    change.shifts[2], weight = 0.5, np.where(np.arange(6) == 2, 0.0, 1.0)
+    np.testing.assert_allclose(change.as_given(views, weight).to_array(), change.to_array(), atol=1e-12)
+    assert np.abs(change.as_given(views).to_array() - change.to_array()).max() > 0.01
+
+
 def test_a_similarity_of_all_cameras_is_no_correction():
     views = PinholeViews.from_sensors([sensor(index) for index in range(6)])
     turn, middle = Rotation.from_rotvec([0.1, -0.2, 0.05]), views.origins.mean(axis=0)

@@ -92,6 +92,24 @@ def test_corrected_poses_are_corrected_further(exact, wrong, errors, bowl):
     np.testing.assert_allclose(told, np.degrees(np.linalg.norm(found.poses[:, :3], axis=1)), atol=1e-4)
 
 
+def test_last_cameras_lie_on_the_surface(exact, bowl):
+    """Even if all of them have to move alike; where the surface is fitted again, they stay in the mean."""
+    shift = np.full(len(exact.views), 0.06)[:, None] * [1.0, 0.0, 0.0]
+    moved = Corrections(np.zeros_like(shift), shift)
+    scene = dataclasses.replace(exact.scene, sensors=moved.sensors(exact.scene.sensors))
+    fit = Fit(scene, exact.config, exact.lattices)
+    before, left = off(fit.views, exact.views), []
+    for last in (False, True):
+        found = Poses("poses", exact.config.cameras, last=last).run(fit, bowl, Silent())
+        left.append(np.median(off(fit.corrected(found).views, exact.views) / before))
+    assert left[0] > 0.7 and left[1] < 0.3
+
+
+def test_without_a_surface_poses_stay(exact, bowl):
+    nothing = bowl.with_fields(msdf=-np.ones_like(bowl.fields.msdf))
+    assert Poses("poses", exact.config.cameras).run(exact, nothing, Silent()) is nothing
+
+
 def test_held_out_views_are_laid_on_the_surface_if_the_others_were(exact, wrong, bowl):
     held_out, kept = wrong.scene.training[::3], np.arange(len(wrong.views)) % 3 > 0
     chosen = [index for index, keep in enumerate(kept) if keep]
