@@ -183,8 +183,10 @@ def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report:
     """Writes what a fit has found; returns the metrics."""
     output, progress, checkpoint = runner.output, runner.progress, runner.checkpoint
     fit = fit.corrected(dataclasses.replace(surface, gains=None))
-    with progress.stage("held-out views", None), runner.timed("held_out"):
-        laid = held_out_views(fit, surface)
+    laid = []
+    if fit.scene.held_out and surface.poses is not None:
+        with progress.stage("held out", None), runner.timed("held_out"):
+            laid = held_out_views(fit, surface)
     with progress.stage("export", None), runner.timed("export"):
         fitted = Fitted.of(fit, surface)
         metrics = export_fit(

@@ -65,7 +65,7 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
             *([Revision(config.openings)] if revises else []),  # what is open after all
             Joint("detail", config.detail, config.detail.iterations),  # the same on the last lattice
             *(
-                [Poses("late_poses", config.cameras, last=True)] if refined else []
+                [Poses("alignment", config.cameras, last=True)] if refined else []
             ),  # further, by what is better now
         ]
     else:

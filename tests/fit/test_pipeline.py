@@ -15,7 +15,7 @@ from gshell_mi.fit.lattices import Lattices
 from gshell_mi.fit.pipeline import pipeline
 from gshell_mi.lattice import TetLattice
 
-END = ["poses", "revision", "detail", "late_poses", "texture"]
+END = ["poses", "revision", "detail", "alignment", "texture"]
 START = ["light", "openings", "exposures", "cavities", "refinement", "folds", "revoxelise"]
 KEPT = [stage for stage in START if stage != "exposures"]
 GEOMETRY = [stage for stage in KEPT if stage != "light"]
@@ -46,11 +46,11 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
         ),
         (
             {"openings.revise": False},
-            ["occlusion", "hull", *START, "volume", "joint", "poses", "detail", "late_poses", "texture"],
+            ["occlusion", "hull", *START, "volume", "joint", "poses", "detail", "alignment", "texture"],
         ),
         (
             {"texture.rounds": 0},
-            ["occlusion", "hull", *START, "volume", "joint", "poses", "revision", "detail", "late_poses"],
+            ["occlusion", "hull", *START, "volume", "joint", "poses", "revision", "detail", "alignment"],
         ),
         ({"model.field": "flexicubes"}, ["occlusion", "hull", *START, "volume", "joint", *END]),
     ],
@@ -62,14 +62,10 @@ def test_stages_from_masks(settings, expected):
 @pytest.mark.parametrize(
     ("opened", "settings", "expected"),
     [
-        (True, {}, ["given", "light", "exposures", "joint", "poses", "detail", "late_poses", "texture"]),
-        (
-            True,
-            {"exposures": "keep"},
-            ["given", "light", "joint", "poses", "detail", "late_poses", "texture"],
-        ),
-        (False, {}, ["given", *START, "joint", "poses", "detail", "late_poses", "texture"]),
-        (True, {"watertight": True}, ["given", *START, "joint", "poses", "detail", "late_poses", "texture"]),
+        (True, {}, ["given", "light", "exposures", "joint", "poses", "detail", "alignment", "texture"]),
+        (True, {"exposures": "keep"}, ["given", "light", "joint", "poses", "detail", "alignment", "texture"]),
+        (False, {}, ["given", *START, "joint", "poses", "detail", "alignment", "texture"]),
+        (True, {"watertight": True}, ["given", *START, "joint", "poses", "detail", "alignment", "texture"]),
     ],
 )
 def test_stages_from_given_fields(tmp_path, opened, settings, expected):

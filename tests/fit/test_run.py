@@ -215,7 +215,8 @@ def test_reads_the_reference_only_for_missing_targets(tmp_path, monkeypatch):
 
 
 def test_interrupted_by_the_user(bowl_scene, tmp_path):
-    output, options = tmp_path / "out", (*CLOSED, "--openings.iterations", "30", "--iterations", "1")
+    output = tmp_path / "out"
+    options = (*CLOSED, "--openings.iterations", "30", "--iterations", "1", "--poses", "keep")
     process = start(bowl_scene, output, "--checkpoint-seconds", "0", *options)
     wait_for_step(process, output, "openings", 5)
     process.send_signal(signal.SIGINT)
@@ -266,11 +267,11 @@ def test_asset_and_report_come_with_a_fit(bowl_scene, tmp_path):
 
 def test_overwriting_keeps_the_earlier_fit_until_the_new_one_is_there(bowl_scene, tmp_path):
     """Interrupted and resumed meanwhile; what no fit wrote stays all along."""
-    output, options = tmp_path / "out", (*CLOSED, "--iterations", "1")
+    output, options = tmp_path / "out", (*CLOSED, "--iterations", "1", "--poses", "keep")
     assert fit(bowl_scene, output, *options) == 0
     (output / "views" / "holiday.jpg").write_text("mine")
     before = {path: path.read_bytes() for path in output.rglob("*.*")}
-    longer = (*CLOSED, "--openings.iterations", "30", "--iterations", "1")
+    longer = (*options, "--openings.iterations", "30")
     assert fit(bowl_scene, output, *longer) == 2
     process = start(bowl_scene, output, "--checkpoint-seconds", "0", "--overwrite", *longer)
     wait_for_step(process, output / ".unfinished", "openings", 5)

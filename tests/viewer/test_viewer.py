@@ -126,7 +126,8 @@ def test_of_a_whole_fit(bowl_scene, tmp_path, capfd, monkeypatch):
         show(self, preview)
 
     monkeypatch.setattr(Viewer, "_show", watch)
-    options = [*SHORT, *CLOSED, "--iterations", "2", "--quiet", "--viewer", "--viewer-port", "0"]
+    options = [*SHORT, *CLOSED, "--iterations", "2", "--poses", "keep"]
+    options += ["--quiet", "--viewer", "--viewer-port", "0"]
     assert main([str(bowl_scene), "-o", str(tmp_path / "out"), *options]) == 0
     assert "live view: http://localhost:" in capfd.readouterr().err
     assert set(seen) == {"openings", "cavities", "refinement", "joint"}

@@ -84,8 +84,8 @@ def test_corrected_poses_are_corrected_further(exact, wrong, errors, bowl):
     """What is told of them is told of those that were given."""
     half = Corrections(-0.5 * errors.rotations, errors.shifts).as_given(wrong.views)
     started, steps = dataclasses.replace(bowl, poses=half.to_array()), Silent()
-    found = Poses("late_poses", exact.config.cameras).run(wrong.corrected(started), started, steps)
-    assert steps.facts["late_poses_kept"]
+    found = Poses("alignment", exact.config.cameras).run(wrong.corrected(started), started, steps)
+    assert steps.facts["alignment_kept"]
     corrected = wrong.corrected(found)
     assert np.median(left(corrected.views, exact.views)) < 0.4 * np.median(left(wrong.views, exact.views))
     told = [view["degrees"] for view in steps.facts["poses"]["views"].values()]
