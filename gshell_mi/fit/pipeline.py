@@ -56,17 +56,17 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
         start.append(Volume(config.volume))  # another start, if it is better
     # Networks are not tied to a lattice: theirs is the last one from the start.
     explicit = parametrisation_named(config.model.field).is_explicit
-    refined = config.poses == "refine"
+    refines = config.poses == "refine"
+    posed = [Poses("poses", config.cameras)] if refines else []
+    aligned = [Poses("alignment", config.cameras, last=True)] if refines else []
     revises = config.openings.revise and not (given or config.watertight)
     if config.iterations and config.detail.iterations and explicit:
         start += [
             Joint("joint", config.joint, config.iterations, lattices.late),  # shape, material and light
-            *([Poses("poses", config.cameras)] if refined else []),  # corrects the cameras
+            *posed,  # corrects the cameras
             *([Revision(config.openings)] if revises else []),  # what is open after all
             Joint("detail", config.detail, config.detail.iterations),  # the same on the last lattice
-            *(
-                [Poses("alignment", config.cameras, last=True)] if refined else []
-            ),  # further, by what is better now
+            *aligned,  # further, by what is better now
         ]
     else:
         start.append(Joint("joint", config.joint, config.iterations, lattices.last))

@@ -48,18 +48,28 @@ class _Normal:
     """Normal equations of N views, of one kind of evidence, of the six numbers of each correction.
 
     Attributes:
+        evidence: of each view.
+        residuals, weights, jacobians: of each view (K,), (K,) robust ones, and (K, 6).
         matrix: (N, 2, 6, 6) of two halves of each image, as if other views were right.
         right: (N, 2, 6).
-        joint: (6 N, 6 N) of all views at once.
-        joint_right: (6 N,).
         variance: of a residual.
     """
 
+    evidence: Sequence[Evidence]
+    residuals: list[np.ndarray]
+    weights: list[np.ndarray]
+    jacobians: list[np.ndarray]
     matrix: np.ndarray
     right: np.ndarray
-    joint: np.ndarray
-    joint_right: np.ndarray
     variance: float
+
+    def joint(self) -> tuple[np.ndarray, np.ndarray]:
+        """(6 N, 6 N) and (6 N,) of all views at once."""
+        about = _about_means(self.evidence, self.weights)
+        parts = zip(self.jacobians, self.weights, about, strict=True)
+        right = [-(jacobian * weight[:, None]).T @ value for jacobian, weight, value in parts]
+        matrix = block_diag(*self.matrix.sum(axis=1))
+        return matrix - _shared(self.evidence, self.jacobians, self.weights), np.concatenate(right)
 
 
 class Alignment:
@@ -79,6 +89,7 @@ class Alignment:
 
     Attributes:
         views: corrected so far, where they lie on the surface.
+        precision: (N,) relative to the others: small for cameras that are far more wrong.
     """
 
     def __init__(self, given: PinholeViews, distance: float, moving: np.ndarray | None = None):
@@ -86,7 +97,7 @@ class Alignment:
         self._moving = np.flatnonzero(np.ones(len(given), bool) if moving is None else moving)
         self._moved = np.zeros((len(given), 6))
         self._spread = np.full(6, _FIRST_GUESS**2)
-        self._precision = np.ones(len(given))
+        self.precision = np.ones(len(given))
         self._noise: dict[int, float] = {}
 
     @property
@@ -97,7 +108,7 @@ class Alignment:
     @property
     def corrections(self) -> Corrections:
         """The same without what all have in common, in which cameras that are far more wrong hardly count."""
-        return self.found.as_given(self._given, self._precision)
+        return self.found.as_given(self._given, self.precision)
 
     def step(self, kinds: Sequence[Sequence[Evidence]]) -> None:
         """One step, by one evidence or more of all views."""
@@ -106,14 +117,15 @@ class Alignment:
         for kind, evidence in enumerate(kinds):
             normal = self._normal(evidence)
             noise = normal.variance * self._excess(kind, normal, now)
-            information += normal.joint / noise
-            pull += normal.joint_right / noise
+            matrix, right = normal.joint()
+            information += matrix / noise
+            pull += right / noise
         moving = self._moving
         free = (6 * moving[:, None] + np.arange(6)).ravel()
         information = information[np.ix_(free, free)]
         pull = pull[free] + information @ now[moving].ravel()
         for _ in range(_EMPIRICAL_BAYES):
-            prior = (self._precision[moving, None] / self._spread).ravel()
+            prior = (self.precision[moving, None] / self._spread).ravel()
             posterior = np.linalg.inv(information + np.diag(prior))
             mean = (posterior @ pull).reshape(-1, 6)
             squares = mean**2 + posterior.diagonal().reshape(-1, 6)
@@ -121,7 +133,7 @@ class Alignment:
             # One spread of rotations and one of shifts, whatever the direction.
             spread = (precision[:, None] * squares).mean(axis=0)
             self._spread = np.maximum(spread.reshape(2, 3).mean(axis=1).repeat(3), 1e-12)
-            self._moved[moving], self._precision[moving] = mean, precision
+            self._moved[moving], self.precision[moving] = mean, precision
         self.views = self.found.views(self._given)
 
     def verdict(self, kinds: Sequence[Sequence[Evidence]]) -> Verdict:
@@ -131,8 +143,8 @@ class Alignment:
             normal = self._normal(evidence)
             prior = normal.variance * np.diag(1 / self._spread)
             steps = np.linalg.solve(normal.matrix + prior, normal.right[..., None])[..., 0]
-            for view, (each, residuals) in enumerate(zip(evidence, _residuals(evidence), strict=True)):
-                left = residuals + (self._jacobian(each, view) * steps[view, 1 - _half(each)]).sum(axis=1)
+            for view, (each, residuals) in enumerate(zip(evidence, normal.residuals, strict=True)):
+                left = residuals + (normal.jacobians[view] * steps[view, 1 - _half(each)]).sum(axis=1)
                 for total, residual in ((before, residuals), (after, left)):
                     total[view] += (each.weights * np.abs(residual)).sum() / np.sqrt(normal.variance)
                 rays[view] += each.weights.sum()
@@ -162,17 +174,13 @@ class Alignment:
             for each, residual in zip(evidence, residuals, strict=True)
         ]
         matrix, right = np.zeros((count, 2, 6, 6)), np.zeros((count, 2, 6))
-        joint_right = np.zeros((count, 6))
-        about = _about_means(evidence, weights)
         for view, (each, jacobian, weight) in enumerate(zip(evidence, jacobians, weights, strict=True)):
             half, weighted = _half(each), jacobian * weight[:, None]
             for part in range(2):
                 chosen = half == part
                 matrix[view, part] = weighted[chosen].T @ jacobian[chosen]
                 right[view, part] = -weighted[chosen].T @ residuals[view][chosen]
-            joint_right[view] = -weighted.T @ about[view]
-        joint = block_diag(*matrix.sum(axis=1)) - _shared(evidence, jacobians, weights)
-        return _Normal(matrix, right, joint, joint_right.ravel(), scale**2)
+        return _Normal(evidence, residuals, weights, jacobians, matrix, right, scale**2)
 
     def _excess(self, kind: int, normal: _Normal, now: np.ndarray) -> float:
         """By how much the variance of a residual has to be larger for what two halves ask for to differ as it
