@@ -20,11 +20,13 @@ class ScriptedJudge:
         self.count, self.error, self.noise = count, error, noise
         self.asked: list[np.ndarray] = []
 
-    def shown(self, mesh: Mesh) -> "ScriptedTemplate":
+    def shown(self, mesh: Mesh, like: object = None) -> "ScriptedTemplate":
         """The template."""
         return ScriptedTemplate(mesh, self)
 
-    def compare(self, before: np.ndarray, after: np.ndarray, label: np.ndarray) -> Verdict:
+    def compare(
+        self, before: np.ndarray, after: np.ndarray, label: np.ndarray, where: object = None
+    ) -> Verdict:
         """By the mean errors of each place's vertices."""
         told = label >= 0
         number = np.maximum(np.bincount(label[told]), 1)

@@ -94,3 +94,10 @@ class Recesses:
         moved = self.vertices.copy()
         moved[self.chosen] += np.minimum(np.minimum(deep, walls), self.room)[:, None] * self.inwards
         return moved
+
+    def halved(self, reach: float) -> np.ndarray:
+        """(V, 3) vertices of the mesh half-way to what lies behind them where that is no farther than twice
+        the reach, as far as walls allow."""
+        moved, far = self.at(reach), self.chosen[self.room > reach]
+        moved[far] = self.vertices[far]
+        return moved

@@ -69,8 +69,7 @@ class Cut:
 def collapsed_sheets(
     cut: Cut, before: np.ndarray, faces: np.ndarray, cell: float, sheet_thickness: float, min_area: float
 ) -> Cut | None:
-    """A moved template without the sides that it can do without; None if there are none, or it would fall
-    apart.
+    """A moved template without the sides that it can do without; None if there are none.
 
     Args:
         cut: the template with them.
@@ -96,8 +95,6 @@ def collapsed_sheets(
     logits[stays] = np.maximum(logits[stays], _LEAST)
     logits = clean_opacity(logits, before, faces, min_area)
     left = topology(*positive_part(before, faces, logits))
-    if left.components > cut.topology.components:
-        return None
     thickness, opposite = opposite_sides(before, before, faces, cell)
     opposite = np.where(np.isfinite(thickness), opposite, -1)
     return Cut(

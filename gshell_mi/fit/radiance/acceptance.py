@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...fields.smoothing import MeshDiffusion
+from ...template.caps import Recesses
 from ...topology import equal_patches, lobes, patch_sizes, vertex_components
 from ..judge import Judge, places_of
 from .shown import Part, Shown
@@ -20,30 +21,6 @@ WORST = 0.5
 
 #: Lambda that smooths what single vertices tell along the mesh: a vertex is met by some hundred rays.
 _SMOOTHING = 10.0
-
-
-def close_shallow(logits: np.ndarray, faces: np.ndarray, thin: np.ndarray) -> np.ndarray:
-    """Closes the openings most of which have the template's other side close behind them.
-
-    A hull is up to about a cell outside of the surface. Through a hole in a thin one, such as a leaf's, the
-    images see what they see of a wall that is a little farther in; which side a sheet keeps, if not both, is
-    told when they have moved.
-
-    Args:
-        logits: (V,) opacity logits; surface where positive.
-        faces: (F, 3) of the template.
-        thin: (V,) where the other side is within two cells.
-
-    Returns:
-        (V,) logits, those of closed openings negated.
-
-    >>> triangles = np.array([[0, 1, 2], [3, 4, 5]])
-    >>> close_shallow(np.full(6, -1.0), triangles, np.array([True, True, False, True, False, False])).tolist()
-    [1.0, 1.0, 1.0, -1.0, -1.0, -1.0]
-    """
-    opened, patch = logits <= 0, equal_patches(logits <= 0, faces)
-    shallow = 2 * np.bincount(patch, thin) > np.bincount(patch)
-    return np.where(opened & shallow[patch], -logits, logits)
 
 
 def close_rejected(
@@ -92,7 +69,7 @@ def close_rejected(
         closed += np.count_nonzero(worst)
         anew = rejected & ~trimmed
         if closing and anew.any():
-            anew &= _gains(judge, faces, before, after, anew) > 0
+            anew &= gains_at(judge, faces, before, after, anew) > 0
             # Crumbs of what is rejected are chance: there are so many of them.
             share = np.bincount(place[kept], anew[kept]) / np.bincount(place[kept])
             anew &= share[place] > 0.5
@@ -103,6 +80,30 @@ def close_rejected(
         if not kept.any():
             break
     return np.where(opened & ~kept, -logits, logits)
+
+
+def close_shallow(logits: np.ndarray, template: Shown, judge: Judge, cell: float) -> np.ndarray:
+    """Closes the openings that do not explain unseen views surely better than lids half-way into thin parts.
+
+    A hull is up to about a cell outside of the surface. Through a hole in a thin one, such as a leaf's, the
+    images see what they see of a wall that is a little farther in; which side a sheet keeps, if not both, is
+    told when they have moved.
+
+    Args:
+        logits, template, judge: as of ``close_rejected``.
+        cell: side of a lattice cell, world units; parts are thin up to two.
+
+    Returns:
+        (V,) logits, those of such openings negated.
+    """
+    opened = logits <= 0
+    if not opened.any():
+        return logits
+    vertices, faces = template.mesh
+    place = places_of(opened, lobes(opened, faces))
+    lids = judge.shown((Recesses(vertices, faces, place).halved(cell), faces), like=template)
+    surely = judge.compare(lids.part(np.abs(logits)), template.part(logits), place, template).accepted
+    return np.where(opened & ~surely[place], -logits, logits)
 
 
 def islands(solid: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -147,7 +148,7 @@ def open_rejected(
     return np.where(island & ~accepted[place], -logits, logits)
 
 
-def _gains(judge: Judge, faces: np.ndarray, before: Part, after: Part, chosen: np.ndarray) -> np.ndarray:
+def gains_at(judge: Judge, faces: np.ndarray, before: Part, after: Part, chosen: np.ndarray) -> np.ndarray:
     """(V,) what each ``chosen`` vertex tells of a change, smoothed along the template; up to a factor."""
     count = len(chosen)
     place = places_of(chosen, np.arange(count))

@@ -23,6 +23,7 @@ from ...scene import FitScene
 from ...template.msdf_transfer import transfer_msdf
 from ..bounds import Between
 from ..joint.joint import JointStage
+from ..lips import without_lips
 from ..runner import Steps
 from ..sheets import with_open_sheets
 from ..stage import Fit
@@ -132,7 +133,8 @@ class Joint:
         result = replace(
             surface, fields=joint.moved_fields(), hull=None, moved=(), model=joint.model(), settled=True
         )
-        return with_open_sheets(fit, without_unseen_parts(fit, result))
+        with steps.task("rims"):
+            return without_lips(fit, with_open_sheets(fit, without_unseen_parts(fit, result)))
 
 
 def start_fields(

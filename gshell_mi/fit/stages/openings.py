@@ -23,7 +23,6 @@ from ...means import mean
 from ...pixels import FAINT
 from ...schedules import decay_at
 from ...template.msdf import clean_opacity, msdf_from_template
-from ...template.sides import opposite_sides
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from ..judge import Judge
@@ -97,15 +96,13 @@ class Openings:
             logits = np.ones(len(vertices))
             if not fit.config.watertight:
                 min_area = fit.config.topology.min_area
-                thickness, _ = opposite_sides(template.start, template.start, faces, fit.cell(surface))
                 logits = find_openings(
                     appearance,
                     closed,
                     fit.judge,
                     self.config.rounds,
-                    lambda logits: close_shallow(
-                        clean_opacity(logits, vertices, faces, min_area), faces, np.isfinite(thickness)
-                    ),
+                    fit.cell(surface),
+                    lambda logits: clean_opacity(logits, vertices, faces, min_area),
                     lambda again: steps.repeat(training, count, again * count),
                 )
             opened = logits <= 0
@@ -188,6 +185,7 @@ def find_openings(
     template: Shown,
     judge: Judge,
     rounds: int,
+    cell: float,
     clean: Callable[[np.ndarray], np.ndarray],
     train: Callable[[int], None],
 ) -> np.ndarray:
@@ -198,8 +196,9 @@ def find_openings(
         template: that it is on, closed.
         judge: of the fit.
         rounds: in which it is trained again, at most.
+        cell: side of a lattice cell, world units.
         clean: undoes what cannot be meant in (V,) logits: cuts and islands that are too small, as
-            ``clean_opacity`` does, and cuts as of ``close_shallow``.
+            ``clean_opacity`` does.
         train: does all steps of its training; told for which time, after the first, from 1.
 
     Returns:
@@ -213,16 +212,15 @@ def find_openings(
         smoothed = appearance.smoothed_logits()
         proposed = clean(np.where(opened, np.minimum(smoothed, _OPEN), smoothed))
         logits = np.where(opened, _OPEN, np.abs(smoothed))
-        logits = clean(
-            justified(
-                smoothed,
-                logits,
-                clean,
-                lambda candidate: open_rejected(
-                    clean(close_rejected(candidate, template, judge, template.whole)), template, judge
-                ),
-            )
+        logits = justified(
+            smoothed,
+            logits,
+            clean,
+            lambda candidate: open_rejected(
+                clean(close_rejected(candidate, template, judge, template.whole)), template, judge
+            ),
         )
+        logits = clean(close_shallow(logits, template, judge, cell))
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
         unjustified |= (proposed <= 0) & (logits > 0)

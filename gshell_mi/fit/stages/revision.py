@@ -24,7 +24,7 @@ from ...template.sides import opposite_sides
 from ...topology import inner, lobes
 from ...triangles import positive_part
 from ..judge import Judge, Verdict, places_of
-from ..radiance.acceptance import CLOSINGS, WORST, close_rejected, close_shallow, islands, open_rejected
+from ..radiance.acceptance import CLOSINGS, WORST, close_rejected, islands, open_rejected
 from ..radiance.shown import Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
@@ -82,7 +82,7 @@ class Revision:
             moved = np.where(capped[:, None], smooth, vertices)
             shown = fit.judge.shown((moved, faces), like=now)
             revised = _with_islands(fit.judge, shown, revised, proposed)
-            revised, recessed = _opened(fit, shown, revised, proposed, thin, cell)
+            revised, recessed = _opened(fit, shown, revised, proposed, cell)
             deeper = (recessed != moved).any(axis=1)
             revised = clean_opacity(revised, moved, faces, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
@@ -172,7 +172,7 @@ def _with_islands(judge: Judge, template: Shown, values: np.ndarray, proposed: n
 
 
 def _opened(
-    fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray, thin: np.ndarray, cell: float
+    fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray, cell: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Opens, or moves deeper, what explains unseen views better so.
 
@@ -181,7 +181,6 @@ def _opened(
         template: closed.
         values: (V,) negative at its openings.
         proposed: (V,) opacity logits.
-        thin: (V,) where the template's other side is within two cells.
         cell: side of a lattice cell, world units.
 
     Returns:
@@ -193,7 +192,7 @@ def _opened(
     def clean(logits: np.ndarray) -> np.ndarray:
         both = np.where(given, values, logits)
         cleaned = clean_opacity(both, vertices, faces, fit.config.topology.min_area)
-        return np.where(given, values, close_shallow(np.where(given, 1.0, cleaned), faces, thin))
+        return np.where(given, values, cleaned)
 
     start, standing = np.where(given, values, np.abs(proposed)), islands(~given, faces)[0]
 

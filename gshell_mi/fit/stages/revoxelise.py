@@ -17,6 +17,7 @@ from ...template.revoxelise import revoxelise
 from ...template.thin_sheets import Cut, collapsed_sheets
 from ...topology import topology
 from ...triangles import positive_part
+from ..judge import Verdict
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Moved, Seen, Surface
@@ -61,10 +62,15 @@ def _taken(
         closed_up = closed_up or (found, stage)
     if closed_up is None:
         return whole
-    meshes = [fit.scene.subject.surface_of(found.fields).to_numpy()[:2] for found, _ in (whole, closed_up)]
-    verdict = fit.judge.decide(*meshes)
+    verdict = _compared(fit, whole[0], closed_up[0])
     steps.fact("closed_loops_verdict", verdict.facts())
     return closed_up if verdict.accepted[0] else whole
+
+
+def _compared(fit: Fit, before: Surface, after: Surface) -> Verdict:
+    """How much better one surface explains unseen views than another."""
+    subject = fit.scene.subject
+    return fit.judge.decide(*(subject.surface_of(each.fields).to_numpy()[:2] for each in (before, after)))
 
 
 def _made(
@@ -72,29 +78,41 @@ def _made(
 ) -> Iterator[tuple[Surface, str, bool]]:
     """The surfaces that come out whole, the best first: with the stage that moved them, and whether they have
     all boundary loops."""
-    subject, lattice, min_area = fit.scene.subject, surface.lattice, fit.config.topology.min_area
     for candidate in moved:
         if (candidate.positions == template.vertices).all():
             continue
-        for cut in _cuts(fit, template, candidate.positions, fit.cell(surface)):
-            made = revoxelise(
-                subject,
-                lattice,
-                template.vertices,
-                cut.positions,
-                template.faces,
-                cut.logits,
-                candidate.radiance,
-                min_area,
-                cut.topology,
-                cut.fewest_loops,
-            )
-            if made:
-                fields = made.fields
-                closed = LatticeFields.closed(fields["sdf"], lattice.grid)
-                seen = Seen(fields["radiance"], fields["known"], surface.seen.light)
-                found = Surface(replace(closed, msdf=fields["msdf"]), seen=seen)
-                yield found, candidate.stage, made.has_loops
+        cuts = _cuts(fit, template, candidate.positions, fit.cell(surface))
+        made = [one for cut in cuts if (one := _revoxelised(fit, template, candidate, cut, surface))]
+        pieces = [cut.topology.components for cut in cuts]
+        # What falls apart may be islands, which sides too many have held together.
+        if len(made) > 1 and pieces[0] > pieces[1] and _compared(fit, made[0][0], made[1][0]).accepted[0]:
+            made.reverse()
+        yield from made
+
+
+def _revoxelised(
+    fit: Fit, template: Template, candidate: Moved, cut: Cut, surface: Surface
+) -> tuple[Surface, str, bool] | None:
+    """As of ``_made``, with one cut; None if it comes out torn."""
+    lattice = surface.lattice
+    made = revoxelise(
+        fit.scene.subject,
+        lattice,
+        template.vertices,
+        cut.positions,
+        template.faces,
+        cut.logits,
+        candidate.radiance,
+        fit.config.topology.min_area,
+        cut.topology,
+        cut.fewest_loops,
+    )
+    if made is None:
+        return None
+    fields = made.fields
+    closed = LatticeFields.closed(fields["sdf"], lattice.grid)
+    seen = Seen(fields["radiance"], fields["known"], surface.seen.light)
+    return Surface(replace(closed, msdf=fields["msdf"]), seen=seen), candidate.stage, made.has_loops
 
 
 def _cuts(fit: Fit, template: Template, moved: np.ndarray, cell: float) -> list[Cut]:

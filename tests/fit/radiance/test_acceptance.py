@@ -1,11 +1,14 @@
 """Which openings and islands stay, for errors that are given."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from cap import cap
 from scripted_judge import ScriptedJudge
 
-from gshell_mi.fit.radiance.acceptance import close_rejected, open_rejected
+from gshell_mi.fit.judge import Verdict
+from gshell_mi.fit.radiance.acceptance import close_rejected, close_shallow, open_rejected
 from gshell_mi.topology import equal_patches
 
 
@@ -137,3 +140,37 @@ def test_nothing_open_nothing_asked(ball):
     logits = np.ones(len(ball.vertices))
     judge = ScriptedJudge(len(logits), None)
     assert close_rejected(logits, judge.shown((ball.vertices, ball.faces)), judge, None) is logits
+
+
+class SheetJudge:
+    """The truth is a sheet at z = 0: what is seen is explained as badly as it is far from that."""
+
+    def __init__(self, error: float):
+        self.error = error
+
+    def shown(self, mesh, like=None):
+        def part(values):
+            return np.where(values > 0, np.abs(mesh[0][:, 2]), self.error)
+
+        return SimpleNamespace(mesh=mesh, part=part)
+
+    def compare(self, before, after, place, where):
+        told, count = place >= 0, place.max() + 1
+        first, second = (np.bincount(place[told], error[told], count) for error in (before, after))
+        return Verdict(first, second, np.log(first / second), np.full(count, 0.05))
+
+
+@pytest.mark.parametrize(
+    ("cell", "error", "stays"),
+    # The other side of a disc, 0.1 away from its middle at most, explains the images as this one does.
+    [(0.2, 0.05, False), (0.2, 1e-4, True), (0.01, 0.05, True)],
+    ids=["another side of a sheet", "better than what is half-way", "not thin"],
+)
+def test_what_a_deeper_lid_explains_is_no_opening(ball, cell, error, stays):
+    disc = ball.vertices * [1, 1, 0.1]
+    logits, judge = np.where(ball.vertices[:, 2] > 0.4, -1.0, 1.0), SheetJudge(error)
+    result = close_shallow(logits, judge.shown((disc, ball.faces)), judge, cell)
+    np.testing.assert_array_equal(result, logits if stays else np.abs(logits))
+    np.testing.assert_array_equal(
+        close_shallow(np.abs(logits), judge.shown((disc, ball.faces)), judge, cell), np.abs(logits)
+    )

@@ -52,3 +52,27 @@ def test_what_nothing_comes_of_stays_as_it_is(monkeypatch):
     monkeypatch.setattr(revoxelise, "_made", lambda *given: iter(()))
     kept, stage = revoxelise._taken(fit(9), None, (), surface("whole"), Silent())
     assert (kept.fields, stage) == ("whole", "")
+
+
+@pytest.mark.parametrize(
+    ("pieces", "gain", "first"),
+    [((3, 2), 1, "cut"), ((3, 2), 9, "as found"), ((2, 2), 9, "cut")],
+    ids=["as good", "surely worse", "not apart"],
+)
+def test_a_cut_that_falls_apart_counts_unless_views_deny_it(pieces, gain, first, monkeypatch):
+    """Without sides that have held its pieces together."""
+    cuts = [
+        SimpleNamespace(name=name, topology=SimpleNamespace(components=count))
+        for name, count in zip(("cut", "as found"), pieces, strict=True)
+    ]
+    monkeypatch.setattr(revoxelise, "_cuts", lambda *given: cuts)
+    monkeypatch.setattr(
+        revoxelise, "_revoxelised", lambda fit, template, moved, cut, start: (cut.name, "folds", True)
+    )
+    monkeypatch.setattr(
+        revoxelise, "_compared", lambda *given: Verdict(*(np.array([x]) for x in (1.0, 1.0, gain, 1.0)))
+    )
+    template = SimpleNamespace(vertices=np.zeros((1, 3)))
+    moved = SimpleNamespace(positions=np.ones((1, 3)))
+    made = revoxelise._made(SimpleNamespace(cell=lambda surface: 1.0), template, [moved], None)
+    assert next(name for name, *_ in made) == first
