@@ -34,8 +34,9 @@ def without_lips(fit: Fit, surface: Surface) -> Surface:
     values = template.interpolate(mi.Float(fields.msdf)).numpy() / lattice.spacing
     if fit.config.watertight or (values > 0).all() or (values <= 0).all():
         return surface
-    now = fit.judge.shown(positive_part(vertices, faces, values))
-    told = told_without_lips(values, fit.judge.shown((vertices, faces), like=now), fit.judge)
+    judge = fit.rim_judge
+    now = judge.shown(positive_part(vertices, faces, values))
+    told = told_without_lips(values, judge.shown((vertices, faces), like=now), judge)
     if (told == values).all():
         return surface
     told = clean_opacity(told, vertices, faces, fit.config.topology.min_area)

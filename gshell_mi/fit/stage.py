@@ -80,9 +80,14 @@ class Fit:
         """Tells what the other views say of what was fitted to ``training``."""
         return self._judge([self._validation])
 
-    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]]) -> Judge:
-        config = self.config
-        return Judge(self.views, self.scene.targets, splits, batch=config.radiance.batch, seed=config.seed)
+    @cached_property
+    def rim_judge(self) -> Judge:
+        """Decides where a surface ends: masks' outlines tell most of that."""
+        return self._judge(Judge.halves(len(self.views)), outline=0)
+
+    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]], **outline: int) -> Judge:
+        config, targets = self.config, self.scene.targets
+        return Judge(self.views, targets, splits, batch=config.radiance.batch, seed=config.seed, **outline)
 
     @property
     def _validation(self) -> tuple[np.ndarray, np.ndarray]:
@@ -101,7 +106,7 @@ class Fit:
         Args:
             surface: that tells; of a fit as it was given.
         """
-        for pool in ("pixels", "training", "judge", "validation_judge"):
+        for pool in ("pixels", "training", "judge", "validation_judge", "rim_judge"):
             self.__dict__.pop(pool, None)
         targets, sensors = self.scene.targets, self.scene.sensors
         if surface.gains is not None:

@@ -19,6 +19,9 @@ from .sides import cast
 #: its area.
 _STEEP = 2.0
 
+#: Share of the way to another side that ends before it.
+_NEARLY = 0.9
+
 #: What holds a cap without surroundings in place, as a share of what bends it.
 _HELD = 1e-6
 
@@ -95,9 +98,9 @@ class Recesses:
         moved[self.chosen] += np.minimum(np.minimum(deep, walls), self.room)[:, None] * self.inwards
         return moved
 
-    def halved(self, reach: float) -> np.ndarray:
-        """(V, 3) vertices of the mesh half-way to what lies behind them where that is no farther than twice
-        the reach, as far as walls allow."""
-        moved, far = self.at(reach), self.chosen[self.room > reach]
-        moved[far] = self.vertices[far]
-        return moved
+    def on_other_sides(self, thickness: float) -> np.ndarray:
+        """(V, 3) vertices of the mesh laid on what lies behind them, as far as walls allow, where that is no
+        farther than a thickness."""
+        way, far = self.at(0.5 * thickness) - self.vertices, self.chosen[2 * self.room > thickness]
+        way[far] = 0
+        return self.vertices + _NEARLY * 2 * way

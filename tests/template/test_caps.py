@@ -51,12 +51,13 @@ def test_a_recess_ends_half_way_to_what_is_behind_it(ball):
     assert recesses.depths(0.3) == pytest.approx([0.3, 0.6, 1.2])
 
 
-def test_only_thin_parts_are_halved(ball):
-    """A disc whose upper side goes to its middle, or stays where that is too far."""
+def test_only_thin_parts_have_another_side(ball):
+    """A disc, whose upper side comes to lie on the lower one, or stays where that is too far."""
     flat = ball.vertices * [1, 1, 0.1]
     place = np.where(ball.vertices[:, 2] > 0.3, 0, -1)
-    thick = flat[:, 2].max()
-    np.testing.assert_array_equal(Recesses(flat, ball.faces, place).halved(0.2 * thick), flat)
-    moved = Recesses(flat, ball.faces, place).halved(1.1 * thick)
+    thick = 2 * flat[:, 2].max()
+    np.testing.assert_array_equal(Recesses(flat, ball.faces, place).on_other_sides(0.2 * thick), flat)
+    moved = Recesses(flat, ball.faces, place).on_other_sides(1.1 * thick)
     np.testing.assert_array_equal(moved[place < 0], flat[place < 0])
-    np.testing.assert_allclose(moved[ball.vertices[:, 2] > 0.6, 2], 0, atol=0.02 * thick)
+    top = ball.vertices[:, 2] > 0.6
+    np.testing.assert_allclose(moved[top, 2], -0.8 * flat[top, 2], atol=0.02 * thick)

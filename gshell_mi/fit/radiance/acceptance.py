@@ -82,16 +82,16 @@ def close_rejected(
     return np.where(opened & ~kept, -logits, logits)
 
 
-def close_shallow(logits: np.ndarray, template: Shown, judge: Judge, cell: float) -> np.ndarray:
-    """Closes the openings that do not explain unseen views surely better than lids half-way into thin parts.
+def close_shallow(logits: np.ndarray, template: Shown, judge: Judge, thickness: float) -> np.ndarray:
+    """Closes the openings that do not explain unseen views surely better than lids on thin parts' other side.
 
-    A hull is up to about a cell outside of the surface. Through a hole in a thin one, such as a leaf's, the
-    images see what they see of a wall that is a little farther in; which side a sheet keeps, if not both, is
-    told when they have moved.
+    A hull is up to about a cell outside of the surface. Through a hole in one side of a thin part, such as a
+    leaf, images see the other side, which may be nearer to where the sheet is. But both are the same sheet,
+    and which of them it keeps is told when they have moved.
 
     Args:
         logits, template, judge: as of ``close_rejected``.
-        cell: side of a lattice cell, world units; parts are thin up to two.
+        thickness: of thin parts, at most, world units.
 
     Returns:
         (V,) logits, those of such openings negated.
@@ -101,7 +101,7 @@ def close_shallow(logits: np.ndarray, template: Shown, judge: Judge, cell: float
         return logits
     vertices, faces = template.mesh
     place = places_of(opened, lobes(opened, faces))
-    lids = judge.shown((Recesses(vertices, faces, place).halved(cell), faces), like=template)
+    lids = judge.shown((Recesses(vertices, faces, place).on_other_sides(thickness), faces), like=template)
     surely = judge.compare(lids.part(np.abs(logits)), template.part(logits), place, template).accepted
     return np.where(opened & ~surely[place], -logits, logits)
 

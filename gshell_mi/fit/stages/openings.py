@@ -38,6 +38,9 @@ from ..template import template_of
 #: rejected: where gloss has made nearly all transparent, an opening still is so the most.
 _LEVELS = 0.0, -0.75, -1.5, -2.25
 
+#: Parts of a hull are thin up to this thickness, in cells: a sheet, and a cell on either side of it.
+_THIN = 2.0
+
 #: Logit, at most, of what has been justified before.
 _OPEN = -1.0
 
@@ -101,7 +104,7 @@ class Openings:
                     closed,
                     fit.judge,
                     self.config.rounds,
-                    fit.cell(surface),
+                    _THIN * fit.cell(surface),
                     lambda logits: clean_opacity(logits, vertices, faces, min_area),
                     lambda again: steps.repeat(training, count, again * count),
                 )
@@ -185,7 +188,7 @@ def find_openings(
     template: Shown,
     judge: Judge,
     rounds: int,
-    cell: float,
+    thickness: float,
     clean: Callable[[np.ndarray], np.ndarray],
     train: Callable[[int], None],
 ) -> np.ndarray:
@@ -196,7 +199,7 @@ def find_openings(
         template: that it is on, closed.
         judge: of the fit.
         rounds: in which it is trained again, at most.
-        cell: side of a lattice cell, world units.
+        thickness: of thin parts, at most, world units.
         clean: undoes what cannot be meant in (V,) logits: cuts and islands that are too small, as
             ``clean_opacity`` does.
         train: does all steps of its training; told for which time, after the first, from 1.
@@ -220,7 +223,7 @@ def find_openings(
                 clean(close_rejected(candidate, template, judge, template.whole)), template, judge
             ),
         )
-        logits = clean(close_shallow(logits, template, judge, cell))
+        logits = clean(close_shallow(logits, template, judge, thickness))
         # A close call may come out otherwise now.
         logits = np.where(opened, np.minimum(logits, _OPEN), logits)
         unjustified |= (proposed <= 0) & (logits > 0)

@@ -12,7 +12,7 @@ from gshell_mi.template.msdf import clean_opacity
 from gshell_mi.topology import equal_patches
 
 BALL = trimesh.creation.icosphere(4)
-VERTICES, FACES, CELL = np.array(BALL.vertices), np.array(BALL.faces), 0.05
+VERTICES, FACES, THIN = np.array(BALL.vertices), np.array(BALL.faces), 0.05
 
 
 class ScriptedRadiance:
@@ -56,7 +56,7 @@ def found_openings(appearance: ScriptedRadiance, rounds: int = 3) -> np.ndarray:
     clean = partial(clean_opacity, vertices=VERTICES, faces=FACES, min_area=0.005)
     judge = ScriptedJudge(len(VERTICES), appearance.error)
     template, train = judge.shown((VERTICES, FACES)), appearance.train
-    return find_openings(appearance, template, judge, rounds, CELL, clean, train) <= 0
+    return find_openings(appearance, template, judge, rounds, THIN, clean, train) <= 0
 
 
 @pytest.mark.parametrize(
