@@ -25,16 +25,17 @@ class ScriptedJudge:
         return ScriptedTemplate(mesh, self)
 
     def compare(
-        self, before: np.ndarray, after: np.ndarray, label: np.ndarray, where: object = None
+        self, before: np.ndarray, after: np.ndarray, label: np.ndarray, where: object = None, places: int = 1
     ) -> Verdict:
-        """By the mean errors of each place's vertices."""
+        """By the mean errors of each place's vertices; nothing is told of a place without any."""
         told = label >= 0
-        number = np.maximum(np.bincount(label[told]), 1)
+        count = np.bincount(label[told], minlength=places)
         first, second = (
-            np.bincount(label[told], self.error(opaque)[told]) / number for opaque in (before, after)
+            np.bincount(label[told], self.error(opaque)[told], places) / np.maximum(count, 1)
+            for opaque in (before, after)
         )
         gain = np.log(np.maximum(first, 1e-9) / np.maximum(second, 1e-9))
-        return Verdict(first, second, gain, np.full(len(gain), self.noise))
+        return Verdict(first, second, gain, np.where(count > 0, self.noise, np.inf))
 
 
 class ScriptedTemplate:

@@ -19,7 +19,7 @@ from .radiance.lanes import chosen_lanes, joined_lanes
 from .radiance.shown import JUDGING, Mesh, Met, Part, Shown
 
 #: Pixels this near to a mask's outline do not judge, unless it is asked where a surface ends to a cell.
-_OUTLINE = 3
+OUTLINE = 3
 
 #: Side of the blocks of an image that are compared, too, in edges of the mesh: some wavelengths of what
 #: colours at vertices can explain. Two of the T-shirt's openings are only told by them in noise of 0.05.
@@ -123,7 +123,7 @@ class Judge:
         *,
         batch: int,
         seed: int = 0,
-        outline: int = _OUTLINE,
+        outline: int = OUTLINE,
     ):
         self.views, self.targets, self.splits = views, targets, splits
         self.batch, self.seed, self.outline = batch, seed, outline

@@ -15,7 +15,7 @@ from ..pixels import PixelPool
 from ..scene import FitScene
 from ..views import PinholeViews
 from .bookkeeping.observer import Preview
-from .judge import Judge
+from .judge import OUTLINE, Judge
 from .lattices import Lattices
 from .poses.corrections import Corrections
 from .surface import Surface
@@ -85,9 +85,15 @@ class Fit:
         """Decides where a surface ends: masks' outlines tell most of that."""
         return self._judge(Judge.halves(len(self.views)), outline=0)
 
-    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]], **outline: int) -> Judge:
-        config, targets = self.config, self.scene.targets
-        return Judge(self.views, targets, splits, batch=config.radiance.batch, seed=config.seed, **outline)
+    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]], outline: int = OUTLINE) -> Judge:
+        return Judge(
+            self.views,
+            self.scene.targets,
+            splits,
+            batch=self.config.radiance.batch,
+            seed=self.config.seed,
+            outline=outline,
+        )
 
     @property
     def _validation(self) -> tuple[np.ndarray, np.ndarray]:

@@ -125,8 +125,8 @@ def _closed(judge: Judge, template: Shown, values: np.ndarray, opposite: np.ndar
     Nothing has shaped the caps so far, and a hull's bulge explains too little to stand for a surface. Through
     one opening others are seen, a mouth through a hole in the bottom, so the worst closes alone before the
     others are judged again. Where an opening ends is found to a cell at best, so vertices at its rim tell
-    nothing; a false slit is little else. Where a sheet has one side, what closes the other one is a cell from
-    it, and looks alike.
+    nothing; a false slit is little else. Nor do those where a sheet has one side: what closes the other one
+    is a cell from it, and looks alike.
 
     Args:
         judge: of the fit.
@@ -143,13 +143,10 @@ def _closed(judge: Judge, template: Shown, values: np.ndarray, opposite: np.ndar
         if not chosen.any():
             break
         place = places_of(chosen, lobes(chosen, faces))
-        middle = np.where(inner(chosen, faces), place, -1)
-        verdict = judge.compare(template.part(values), template.whole, middle)
         backed = thin & (values[opposite] > 0)
-        alone = 2 * np.bincount(place[chosen], backed[chosen]) <= np.bincount(place[chosen])
-        gain = np.zeros(len(alone))
-        told = np.flatnonzero(np.isfinite(verdict.noise))
-        gain[told] = alone[told] * (verdict.gain + _STANDING * verdict.noise)[told]
+        middle = np.where(inner(chosen, faces) & ~backed, place, -1)
+        verdict = judge.compare(template.part(values), template.whole, middle, places=place.max() + 1)
+        gain = np.where(np.isfinite(verdict.noise), verdict.gain + _STANDING * verdict.noise, 0)
         if gain.max() <= 0:
             break
         rejected = gain == gain.max() if closing else gain > 0

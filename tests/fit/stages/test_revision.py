@@ -134,6 +134,21 @@ def test_the_rim_of_an_opening_does_not_speak_for_it(better, stays):
     np.testing.assert_array_equal(found <= 0, slit & stays)
 
 
+@pytest.mark.parametrize("backed", ["all", "half"])
+def test_the_open_side_of_a_sheet_does_not_speak_for_its_cap(backed):
+    """Its cap explains more; where a sheet has its other side behind, that is no wonder."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    opened, half = cap(ball, [0, 0, 1], 0.1), ball.vertices[:, 0] > 0
+    sheet = opened & (half if backed == "half" else True)
+    error = np.where(half, 3.0, 0.3)
+    judge = ScriptedJudge(len(ball.vertices), lambda opaque: np.where(opaque, 1.0, error))
+    template, values = judge.shown((ball.vertices, ball.faces)), np.where(opened, -1.0, 1.0)
+    below = int(ball.vertices[:, 2].argmin())
+    np.testing.assert_array_equal(_closed(judge, template, values, np.where(sheet, below, -1)), values)
+    closed = _closed(judge, template, values, np.full(len(values), -1))
+    np.testing.assert_array_equal(closed, np.abs(values))
+
+
 def vertices_of(fit, surface):
     """(V, 3) vertices of the surface."""
     return fit.scene.subject.surface_of(surface.fields).to_numpy()[0]
