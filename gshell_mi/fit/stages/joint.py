@@ -133,8 +133,11 @@ class Joint:
         result = replace(
             surface, fields=joint.moved_fields(), hull=None, moved=(), model=joint.model(), settled=True
         )
+        result = with_open_sheets(fit, without_unseen_parts(fit, result))
+        if not self.iterations:
+            return result
         with steps.task("rims"):
-            return without_lips(fit, with_open_sheets(fit, without_unseen_parts(fit, result)))
+            return without_lips(fit, result)
 
 
 def start_fields(
