@@ -18,8 +18,8 @@ from .radiance.contrast import Contrast
 from .radiance.lanes import chosen_lanes, joined_lanes
 from .radiance.shown import JUDGING, Mesh, Met, Part, Shown
 
-#: Pixels this near to a mask's outline do not judge, unless it is asked where a surface ends to a cell.
-OUTLINE = 3
+#: Pixels this near to a mask's outline do not judge: where a surface ends to a cell is found later.
+_OUTLINE = 3
 
 #: Side of the blocks of an image that are compared, too, in edges of the mesh: some wavelengths of what
 #: colours at vertices can explain. Two of the T-shirt's openings are only told by them in noise of 0.05.
@@ -108,11 +108,10 @@ class Judge:
     texture hide what pixels tell, and means hide what is patterned.
 
     Args:
-        views, targets: the images.
+        views, targets: the images. Pixels beside the masks' outlines do not count.
         splits: indices of the views that tell the colours, and of those that judge; one pair or more.
         batch: pixels per batch of rays.
         seed: of the random pixels.
-        outline: pixels this near to a mask's outline do not judge.
     """
 
     def __init__(
@@ -123,10 +122,9 @@ class Judge:
         *,
         batch: int,
         seed: int = 0,
-        outline: int = OUTLINE,
     ):
         self.views, self.targets, self.splits = views, targets, splits
-        self.batch, self.seed, self.outline = batch, seed, outline
+        self.batch, self.seed = batch, seed
 
     @staticmethod
     def halves(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -140,7 +138,7 @@ class Judge:
         return [
             (
                 PixelPool(self.views, self.targets, known),
-                PixelPool(self.views, self.targets, unknown, self.outline),
+                PixelPool(self.views, self.targets, unknown, _OUTLINE),
             )
             for known, unknown in self.splits
         ]

@@ -15,7 +15,7 @@ from ..pixels import PixelPool
 from ..scene import FitScene
 from ..views import PinholeViews
 from .bookkeeping.observer import Preview
-from .judge import OUTLINE, Judge
+from .judge import Judge
 from .lattices import Lattices
 from .poses.corrections import Corrections
 from .surface import Surface
@@ -80,20 +80,9 @@ class Fit:
         """Tells what the other views say of what was fitted to ``training``."""
         return self._judge([self._validation])
 
-    @cached_property
-    def rim_judge(self) -> Judge:
-        """Decides where a surface ends: masks' outlines tell most of that."""
-        return self._judge(Judge.halves(len(self.views)), outline=0)
-
-    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]], outline: int = OUTLINE) -> Judge:
-        return Judge(
-            self.views,
-            self.scene.targets,
-            splits,
-            batch=self.config.radiance.batch,
-            seed=self.config.seed,
-            outline=outline,
-        )
+    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]]) -> Judge:
+        config = self.config
+        return Judge(self.views, self.scene.targets, splits, batch=config.radiance.batch, seed=config.seed)
 
     @property
     def _validation(self) -> tuple[np.ndarray, np.ndarray]:
@@ -112,7 +101,7 @@ class Fit:
         Args:
             surface: that tells; of a fit as it was given.
         """
-        for pool in ("pixels", "training", "judge", "validation_judge", "rim_judge"):
+        for pool in ("pixels", "training", "judge", "validation_judge"):
             self.__dict__.pop(pool, None)
         targets, sensors = self.scene.targets, self.scene.sensors
         if surface.gains is not None:

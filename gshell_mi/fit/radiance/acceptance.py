@@ -69,7 +69,7 @@ def close_rejected(
         closed += np.count_nonzero(worst)
         anew = rejected & ~trimmed
         if closing and anew.any():
-            anew &= gains_at(judge, faces, before, after, anew) > 0
+            anew &= _gains(judge, faces, before, after, anew) > 0
             # Crumbs of what is rejected are chance: there are so many of them.
             share = np.bincount(place[kept], anew[kept]) / np.bincount(place[kept])
             anew &= share[place] > 0.5
@@ -148,7 +148,7 @@ def open_rejected(
     return np.where(island & ~accepted[place], -logits, logits)
 
 
-def gains_at(judge: Judge, faces: np.ndarray, before: Part, after: Part, chosen: np.ndarray) -> np.ndarray:
+def _gains(judge: Judge, faces: np.ndarray, before: Part, after: Part, chosen: np.ndarray) -> np.ndarray:
     """(V,) what each ``chosen`` vertex tells of a change, smoothed along the template; up to a factor."""
     count = len(chosen)
     place = places_of(chosen, np.arange(count))

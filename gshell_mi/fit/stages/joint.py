@@ -23,7 +23,6 @@ from ...scene import FitScene
 from ...template.msdf_transfer import transfer_msdf
 from ..bounds import Between
 from ..joint.joint import JointStage
-from ..lips import without_lips
 from ..runner import Steps
 from ..sheets import with_open_sheets
 from ..stage import Fit
@@ -133,11 +132,7 @@ class Joint:
         result = replace(
             surface, fields=joint.moved_fields(), hull=None, moved=(), model=joint.model(), settled=True
         )
-        result = with_open_sheets(fit, without_unseen_parts(fit, result))
-        if not self.iterations:
-            return result
-        with steps.task("rims"):
-            return without_lips(fit, result)
+        return with_open_sheets(fit, without_unseen_parts(fit, result))
 
 
 def start_fields(
