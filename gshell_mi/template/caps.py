@@ -19,7 +19,7 @@ from .sides import cast
 #: its area.
 _STEEP = 2.0
 
-#: Share of the way to another side that ends before it.
+#: Share of the way to another side after which a lid lies on it: after all of it both would be one.
 _NEARLY = 0.9
 
 #: What holds a cap without surroundings in place, as a share of what bends it.

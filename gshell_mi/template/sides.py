@@ -8,6 +8,9 @@ import trimesh
 
 from ..compat import mesh_scene
 
+#: Parts of a template are thin up to this thickness, in cells: a sheet, and a cell on either side of it.
+THIN = 2.0
+
 
 def opposite_sides(
     before: np.ndarray, moved: np.ndarray, faces: np.ndarray, cell: float
@@ -23,15 +26,15 @@ def opposite_sides(
         cell: side of a lattice cell, in the positions' unit.
 
     Returns:
-        (V,) thickness after the movement, infinite if there is no other side within two cells; (V,) nearest
-        vertex of the other side, arbitrary then.
+        (V,) thickness after the movement, infinite if there is no other side within ``THIN`` cells; (V,)
+        nearest vertex of the other side, arbitrary then.
     """
     offset = 1e-3 * cell
     normals = normals_at_vertices(moved, faces)
     thickness, opposite = np.full(len(moved), np.inf), np.zeros(len(moved), int)
     for positions in (before, moved):
         inwards = -normals_at_vertices(positions, faces)
-        face, weights, distance = cast(positions, faces, positions + offset * inwards, inwards, 2 * cell)
+        face, weights, distance = cast(positions, faces, positions + offset * inwards, inwards, THIN * cell)
         point = np.einsum("ni,nij->nj", weights, moved[faces[face]])
         depth = np.where(np.isfinite(distance), np.einsum("nj,nj->n", moved - point, normals), np.inf)
         nearer = depth < thickness

@@ -23,6 +23,7 @@ from ...means import mean
 from ...pixels import FAINT
 from ...schedules import decay_at
 from ...template.msdf import clean_opacity, msdf_from_template
+from ...template.sides import THIN
 from ..bookkeeping.observer import Preview
 from ..bounds import Between
 from ..judge import Judge
@@ -37,9 +38,6 @@ from ..template import template_of
 #: Logits below which connected parts are proposed as openings, one after the other as long as some are
 #: rejected: where gloss has made nearly all transparent, an opening still is so the most.
 _LEVELS = 0.0, -0.75, -1.5, -2.25
-
-#: Parts of a hull are thin up to this thickness, in cells: a sheet, and a cell on either side of it.
-_THIN = 2.0
 
 #: Logit, at most, of what has been justified before.
 _OPEN = -1.0
@@ -104,7 +102,7 @@ class Openings:
                     closed,
                     fit.judge,
                     self.config.rounds,
-                    _THIN * fit.cell(surface),
+                    THIN * fit.cell(surface),
                     lambda logits: clean_opacity(logits, vertices, faces, min_area),
                     lambda again: steps.repeat(training, count, again * count),
                 )

@@ -82,12 +82,16 @@ def _made(
         if (candidate.positions == template.vertices).all():
             continue
         cuts = _cuts(fit, template, candidate.positions, fit.cell(surface))
-        made = [one for cut in cuts if (one := _revoxelised(fit, template, candidate, cut, surface))]
-        pieces = [cut.topology.components for cut in cuts]
-        # What falls apart may be islands, which sides too many have held together.
-        if len(made) > 1 and pieces[0] > pieces[1] and _compared(fit, made[0][0], made[1][0]).accepted[0]:
-            made.reverse()
-        yield from made
+        # Each is made when it is asked for: mostly the first is whole.
+        made = (one for cut in cuts if (one := _revoxelised(fit, template, candidate, cut, surface)))
+        if cuts[0].topology.components > cuts[-1].topology.components:
+            # What falls apart may be islands, which sides too many have held together.
+            both = list(made)
+            if len(both) > 1 and _compared(fit, both[0][0], both[1][0]).accepted[0]:
+                both.reverse()
+            yield from both
+        else:
+            yield from made
 
 
 def _revoxelised(
