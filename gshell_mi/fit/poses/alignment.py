@@ -94,11 +94,11 @@ class Alignment:
 
     def __init__(self, given: PinholeViews, distance: float, moving: np.ndarray | None = None):
         self._given, self._distance, self.views = given, distance, given
-        self._moving = np.flatnonzero(np.ones(len(given), bool) if moving is None else moving)
         self._moved = np.zeros((len(given), 6))
         self._spread = np.full(6, _FIRST_GUESS**2)
         self.precision = np.ones(len(given))
         self._noise: dict[int, float] = {}
+        self.only(np.ones(len(given), bool) if moving is None else moving)
 
     @property
     def found(self) -> Corrections:
@@ -107,8 +107,15 @@ class Alignment:
 
     @property
     def corrections(self) -> Corrections:
-        """The same without what all have in common, in which cameras that are far more wrong hardly count."""
+        """The same without what all have in common, in which cameras that are far more wrong hardly count;
+        nothing is in common with cameras that may not move."""
+        if len(self._moving) < len(self._given):
+            return self.found
         return self.found.as_given(self._given, self.precision)
+
+    def only(self, moving: np.ndarray) -> None:
+        """Lets (N,) some cameras move, and no others."""
+        self._moving = np.flatnonzero(moving)
 
     def step(self, kinds: Sequence[Sequence[Evidence]]) -> None:
         """One step, by one evidence or more of all views."""
@@ -136,19 +143,28 @@ class Alignment:
             self._moved[moving], self.precision[moving] = mean, precision
         self.views = self.found.views(self._given)
 
-    def verdict(self, kinds: Sequence[Sequence[Evidence]]) -> Verdict:
-        """Whether steps are worth it: what one half of each image asks for has to explain the other half."""
-        rays, before, after = (np.zeros(len(self._given)) for _ in range(3))
+    def verdicts(self, kinds: Sequence[Sequence[Evidence]]) -> tuple[Verdict, Verdict]:
+        """Whether steps are worth it: what one half of each image asks for has to explain the other half.
+
+        Returns:
+            That on all cameras, told by the views, and that on each, told by the squares of its image: of
+            many, a single one that is wrong is seen only so.
+        """
+        columns, rows = np.ceil(self._given.sizes.max(axis=0) / _SQUARE).astype(int)
+        rays, before, after = (np.zeros((len(self._given), columns * rows)) for _ in range(3))
         for evidence in kinds:
             normal = self._normal(evidence)
             prior = normal.variance * np.diag(1 / self._spread)
             steps = np.linalg.solve(normal.matrix + prior, normal.right[..., None])[..., 0]
             for view, (each, residuals) in enumerate(zip(evidence, normal.residuals, strict=True)):
                 left = residuals + (normal.jacobians[view] * steps[view, 1 - _half(each)]).sum(axis=1)
-                for total, residual in ((before, residuals), (after, left)):
-                    total[view] += (each.weights * np.abs(residual)).sum() / np.sqrt(normal.variance)
-                rays[view] += each.weights.sum()
-        return verdict_of(rays[None], before[None], after[None])
+                square = np.ravel_multi_index(tuple(_squares(each).T), (columns, rows), mode="clip")
+                for total, value in ((before, residuals), (after, left)):
+                    errors = each.weights * np.abs(value) / np.sqrt(normal.variance)
+                    total[view] += np.bincount(square, errors, columns * rows)
+                rays[view] += np.bincount(square, each.weights, columns * rows)
+        every = verdict_of(*(values.sum(axis=1)[None] for values in (rays, before, after)))
+        return every, verdict_of(rays, before, after)
 
     def _jacobian(self, evidence: Evidence, view: int) -> np.ndarray:
         """(K, 6) derivatives of the values, in radians and parts of the distance."""
@@ -251,4 +267,9 @@ def _shared(
 
 def _half(evidence: Evidence) -> np.ndarray:
     """(K,) which half of the image, 0 or 1, like the squares of a chessboard."""
-    return (np.floor(evidence.pixels / _SQUARE).astype(int).sum(axis=1) % 2).astype(int)
+    return _squares(evidence).sum(axis=1) % 2
+
+
+def _squares(evidence: Evidence) -> np.ndarray:
+    """(K, 2) column and row of the square of the image."""
+    return np.floor(evidence.pixels / _SQUARE).astype(int)

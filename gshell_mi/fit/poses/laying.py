@@ -13,7 +13,7 @@ from ...views import PinholeViews
 from ..bounds import Between
 from ..judge import Verdict
 from .alignment import Alignment
-from .evidence import Outline, Texture
+from .evidence import Evidence, Outline, Texture
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class CamerasConfig:
     rounds: Annotated[int, Between(1)] = 3
     """Steps for each of them."""
     least: Annotated[float, Between(0)] = 0.2
-    """Pixels by which views have to move, in the root mean square: poses of renders move by a tenth."""
+    """Pixels by which the views that may move have to move, in the root mean square: poses of renders move by
+    a tenth."""
 
 
 class Laying:
@@ -64,26 +65,28 @@ class Laying:
         self.alignment = Alignment(views, distance, moving)
         self._texture = Texture(mesh, targets, config.places, cell, seed)
         self._outline, self._config = Outline(mesh, targets), config
-        self._verdict: Verdict | None = None
         self.points = self._texture.points
 
-    def level(self, number: int, advance: Callable[[], object] = lambda: None) -> Verdict:
+    def verdicts(self) -> tuple[Verdict, Verdict]:
+        """Whether corrections are worth it: those of all cameras, and that of each."""
+        return self.alignment.verdicts(self._kinds(self._comparison(0)))
+
+    def level(self, number: int, advance: Callable[[], object] = lambda: None) -> None:
         """The steps of a level; levels come in their order.
 
         Args:
             number: of the level, from 0 on: how often the blur is halved.
             advance: is told of each step.
-
-        Returns:
-            Whether corrections are worth it, as is told before the first step of the first level.
         """
-        alignment, verdict = self.alignment, self._verdict
-        texture = self._texture.level(self._config.blur / 2**number, alignment.views)
+        texture = self._comparison(number)
         for _ in range(self._config.rounds):
-            kinds = texture(alignment.views), self._outline.evidence(alignment.views)
-            verdict = verdict or alignment.verdict(kinds)
-            alignment.step(kinds)
+            self.alignment.step(self._kinds(texture))
             advance()
-        assert verdict
-        self._verdict = verdict
-        return verdict
+
+    def _comparison(self, number: int) -> Callable[[PinholeViews], list[Evidence]]:
+        """Of texture, at a level."""
+        return self._texture.level(self._config.blur / 2**number, self.alignment.views)
+
+    def _kinds(self, texture: Callable[[PinholeViews], list[Evidence]]) -> list[list[Evidence]]:
+        """Evidence where cameras are now."""
+        return [texture(self.alignment.views), self._outline.evidence(self.alignment.views)]

@@ -24,6 +24,8 @@ from ..surface import Surface
 class Poses:
     """Corrects the cameras, if one half of each image foretells the other by that.
 
+    All are, if that is so in the mean over the views; else those of which it is.
+
     Args:
         name: of the stage.
         config: its settings.
@@ -43,14 +45,19 @@ class Poses:
             laying = Laying(
                 mesh, fit.views, fit.scene.targets, config, cell=fit.cell(surface), seed=fit.config.seed
             )
-            for level in range(config.levels):
-                verdict = laying.level(level, advance)
+            every, each = laying.verdicts()
+            moving = each.accepted | every.accepted[0]
+            laying.alignment.only(moving)
+            corrections, moved = laying.alignment.corrections, 0.0
+            for level in range(config.levels if moving.any() else 0):
+                laying.level(level, advance)
                 corrections = laying.alignment.found if self._last else laying.alignment.corrections
-                moved = float(np.sqrt((corrections.in_pixels(fit.views, laying.points) ** 2).mean()))
-                kept = bool(verdict.accepted[0]) and moved > config.least
-                if not kept:
+                moved = float(np.sqrt((corrections.in_pixels(fit.views, laying.points)[moving] ** 2).mean()))
+                if moved <= config.least:
                     break
-        steps.fact(f"{self.name}_verdict", verdict.facts() | {"pixels": round(moved, 3)})
+        kept = moved > config.least
+        told = {"pixels": round(moved, 3), "cameras": int(moving.sum())}
+        steps.fact(f"{self.name}_verdict", every.facts() | told)
         steps.fact(f"{self.name}_kept", kept)
         if not kept:
             return surface

@@ -13,8 +13,10 @@ from silent_steps import Silent
 from gshell_mi.export.stock_scene import write_scene
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+from gshell_mi.fit.judge import Verdict
 from gshell_mi.fit.poses.corrections import Corrections
 from gshell_mi.fit.poses.held_out import held_out_views
+from gshell_mi.fit.poses.laying import Laying
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.poses import Poses
 from gshell_mi.fit.surface import Surface
@@ -135,6 +137,23 @@ def test_exact_poses_stay(exact, bowl):
     steps = Silent()
     assert Poses("poses", exact.config.cameras).run(exact, bowl, steps) is bowl
     assert steps.facts["poses_kept"] is False and "poses" not in steps.facts
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_a_single_wrong_camera_is_corrected_alone(exact, errors, bowl, monkeypatch, last):
+    """If its own image says so; all views together say nothing of it."""
+    count = len(exact.views)
+    alone = np.arange(count) == 5
+    zero, one = np.zeros(count), np.ones(count)
+    told = Verdict(zero[:1], zero[:1], zero[:1], one[:1]), Verdict(zero, zero, np.where(alone, 9.0, 0), one)
+    monkeypatch.setattr(Laying, "verdicts", lambda self: told)
+    wrong = Corrections(np.where(alone[:, None], errors.rotations, 0), errors.shifts)
+    scene = dataclasses.replace(exact.scene, sensors=wrong.sensors(exact.scene.sensors))
+    fit, steps = Fit(scene, exact.config, exact.lattices), Silent()
+    found = Poses("poses", exact.config.cameras, last=last).run(fit, bowl, steps)
+    assert steps.facts["poses_verdict"]["cameras"] == 1
+    assert np.flatnonzero(np.abs(found.poses).sum(axis=1)).tolist() == [5]
+    assert off(fit.corrected(found).views, exact.views)[5] < 0.4 * off(fit.views, exact.views)[5]
 
 
 def test_without_masks_poses_stay(exact, wrong, bowl):
