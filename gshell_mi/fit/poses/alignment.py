@@ -93,12 +93,16 @@ class Alignment:
     """
 
     def __init__(self, given: PinholeViews, distance: float, moving: np.ndarray | None = None):
-        self._given, self._distance, self.views = given, distance, given
-        self._moved = np.zeros((len(given), 6))
+        self._given, self._distance = given, distance
+        self.start(np.ones(len(given), bool) if moving is None else moving)
+
+    def start(self, moving: np.ndarray) -> None:
+        """From the given cameras; (N,) which may move."""
+        self.views, self._moving = self._given, np.flatnonzero(moving)
+        self._moved = np.zeros((len(moving), 6))
         self._spread = np.full(6, _FIRST_GUESS**2)
-        self.precision = np.ones(len(given))
+        self.precision = np.ones(len(moving))
         self._noise: dict[int, float] = {}
-        self.only(np.ones(len(given), bool) if moving is None else moving)
 
     @property
     def found(self) -> Corrections:
@@ -112,10 +116,6 @@ class Alignment:
         if len(self._moving) < len(self._given):
             return self.found
         return self.found.as_given(self._given, self.precision)
-
-    def only(self, moving: np.ndarray) -> None:
-        """Lets (N,) some cameras move, and no others."""
-        self._moving = np.flatnonzero(moving)
 
     def step(self, kinds: Sequence[Sequence[Evidence]]) -> None:
         """One step, by one evidence or more of all views."""

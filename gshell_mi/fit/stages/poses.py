@@ -24,7 +24,7 @@ from ..surface import Surface
 class Poses:
     """Corrects the cameras, if one half of each image foretells the other by that.
 
-    All are, if that is so in the mean over the views; else those of which it is.
+    All are, if that is so in the mean over the views, and else those of which it is.
 
     Args:
         name: of the stage.
@@ -41,23 +41,17 @@ class Poses:
         config, mesh = self.config, fit.scene.subject.surface_of(surface.fields).to_numpy()[:2]
         if not (fit.pixels.has_alpha and len(mesh[1])):
             return surface
-        with steps.task(total=config.levels * config.rounds) as advance:
-            laying = Laying(
-                mesh, fit.views, fit.scene.targets, config, cell=fit.cell(surface), seed=fit.config.seed
-            )
-            every, each = laying.verdicts()
-            moving = each.accepted | every.accepted[0]
-            laying.alignment.only(moving)
-            corrections, moved = laying.alignment.corrections, 0.0
-            for level in range(config.levels if moving.any() else 0):
-                laying.level(level, advance)
-                corrections = laying.alignment.found if self._last else laying.alignment.corrections
-                moved = float(np.sqrt((corrections.in_pixels(fit.views, laying.points)[moving] ** 2).mean()))
-                if moved <= config.least:
-                    break
-        kept = moved > config.least
-        told = {"pixels": round(moved, 3), "cameras": int(moving.sum())}
-        steps.fact(f"{self.name}_verdict", every.facts() | told)
+        laying = Laying(
+            mesh, fit.views, fit.scene.targets, config, cell=fit.cell(surface), seed=fit.config.seed
+        )
+        every, each = laying.verdicts()
+        corrections, kept, told = laying.alignment.corrections, False, every.facts()
+        for moving in (np.full(len(fit.views), every.accepted[0]), each.accepted):
+            if not kept and moving.any():
+                corrections, moved = self._laid(fit, laying, moving, steps)
+                kept = moved > config.least
+                told |= {"pixels": round(moved, 3), "cameras": int(moving.sum())}
+        steps.fact(f"{self.name}_verdict", told)
         steps.fact(f"{self.name}_kept", kept)
         if not kept:
             return surface
@@ -67,6 +61,20 @@ class Poses:
             corrections, given = corrections.after(before), before.inverse().views(given)
         steps.fact("poses", _facts(given, corrections, laying.points))
         return replace(surface, poses=corrections.to_array(), settled=False)
+
+    def _laid(self, fit: Fit, laying: Laying, moving: np.ndarray, steps: Steps) -> tuple[Corrections, float]:
+        """Corrections of (N,) some cameras, and the root mean square of the pixels that they move by."""
+        laying.alignment.start(moving)
+        corrections, moved = laying.alignment.corrections, 0.0
+        with steps.task(total=self.config.levels * self.config.rounds) as advance:
+            for level in range(self.config.levels):
+                laying.level(level, advance)
+                corrections = laying.alignment.found if self._last else laying.alignment.corrections
+                pixels = corrections.in_pixels(fit.views, laying.points)[moving]
+                moved = float(np.sqrt((pixels**2).mean()))
+                if moved <= self.config.least:
+                    break
+        return corrections, moved
 
 
 def _facts(given: PinholeViews, corrections: Corrections, points: np.ndarray) -> dict[str, Any]:
