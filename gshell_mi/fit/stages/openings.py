@@ -169,16 +169,20 @@ def justified(
     Returns:
         (V,) logits, negative at openings.
     """
+    levels = 0
     for level in _LEVELS:
         # Openings of the levels before, and what is as transparent as this one.
         candidate = clean(np.minimum(logits, smoothed - level))
         if not ((candidate <= 0) & (logits > 0)).any():
             continue
         found = clean(judged(candidate))
+        levels += bool(((found <= 0) & (logits > 0)).any())
+        # What was proposed may have run together with what is rejected now.
         logits = np.minimum(logits, found)
         if ((found <= 0) == (candidate <= 0)).all():
             break
-    return logits
+    # Those of one level have not been judged beside those of the next ones, through which they may be seen.
+    return clean(judged(logits)) if levels > 1 else logits
 
 
 def find_openings(
