@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scripted_judge import ScriptedJudge
 
-from gshell_mi.fit.stages.openings import find_openings
+from gshell_mi.fit.stages.openings import find_openings, justified
 from gshell_mi.template.msdf import clean_opacity
 from gshell_mi.topology import equal_patches
 
@@ -100,3 +100,17 @@ def test_where_nearly_all_has_become_transparent_the_most_transparent_part_is_pr
     appearance = Glossy(((0, 0, 1),), (), ())
     appearance.false = ~appearance.cap((0, 0, 1))
     np.testing.assert_array_equal(found_openings(appearance, rounds=0), appearance.cap((0, 0, 1)))
+
+
+def test_what_a_later_opening_shows_to_be_wrong_does_not_stay():
+    """A hole seems justified as long as the mouth that one looks out of through it is closed, as gloss beside
+    it is proposed together with it."""
+    hole, mouth, gloss = np.eye(3, dtype=bool)
+    smoothed = np.where(hole, -1.0, np.where(mouth, -2.0, -0.5))
+
+    def judged(candidate: np.ndarray) -> np.ndarray:
+        wrong = ~hole if (candidate <= 0)[gloss].any() else hole if (candidate <= 0)[mouth].any() else gloss
+        return np.where(wrong, np.abs(candidate), candidate)
+
+    logits = justified(smoothed, np.full(3, 2.0), lambda logits: logits, judged)
+    assert ((logits <= 0) == mouth).all()
