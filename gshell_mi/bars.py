@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskID
+
+Value = TypeVar("Value")
 
 #: Seconds between two lines where there is no terminal.
 PAUSE = 30.0
@@ -38,6 +41,13 @@ class Bars(Progress):
         """Takes a task so many steps on."""
         super().advance(task_id, advance)
         self._tell(task_id)
+
+    def each(self, values: Iterable[Value], total: int) -> Iterator[Value]:
+        """The values, of which there are so many, as a task; ``track`` of rich tells nothing in lines."""
+        task = self.add_task("", total=total)
+        for value in values:
+            yield value
+            self.advance(task)
 
     def _tell(self, task_id: TaskID) -> None:
         now = time.monotonic()

@@ -6,6 +6,7 @@ minute.
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections import deque
@@ -43,7 +44,7 @@ class Progress:
             console=self._console,
             disable=quiet or self._in_lines,
         )
-        self._reference = None
+        self._reference, self._told = None, -math.inf
 
     def __enter__(self) -> Progress:
         self._bars.start()
@@ -108,6 +109,10 @@ class Progress:
         if self._reference is None:
             self._reference = self._bars.add_task("references", total=total, detail="")
         self._bars.update(self._reference, completed=done, total=total, detail=f"{done}/{total} rendered")
+        now = time.monotonic()
+        if done < total and now - self._told >= PAUSE:
+            self._told = now
+            self._line("targets", f"{done}/{total} rendered")
 
 
 def usual_duration(durations: Collection[float]) -> float:

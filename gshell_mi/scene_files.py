@@ -58,7 +58,7 @@ def load_scene(path: str | Path, *, name: str = "Scene") -> mi.Scene:
         raise
     except Exception as error:
         raise UserError(
-            f"{name} '{path}' cannot be loaded by Mitsuba: {_reason(error)}; correct it."
+            f"{name} '{path}' cannot be loaded by Mitsuba: {_reason(error)}; {_remedy(path)}."
         ) from error
     scene = scene[0] if isinstance(scene, list) and len(scene) == 1 else scene
     if not isinstance(scene, mi.Scene):
@@ -183,6 +183,10 @@ def _is_plain_exr(path: Path) -> bool:
 
     windows = OpenEXR.File(str(path), header_only=True).parts[0].header
     return all((windows["dataWindow"][end] == windows["displayWindow"][end]).all() for end in (0, 1))
+
+
+def _remedy(path: Path) -> str:
+    return "correct it" if path.suffix.lower() == ".xml" else "a scene is an XML file, give one"
 
 
 def _reason(error: Exception) -> str:

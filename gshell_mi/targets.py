@@ -66,7 +66,8 @@ def load_target(path: Path, width: int, height: int) -> Target:
     """
     if not path.is_file():
         raise UserError(
-            f"Target '{path}' is missing; render or copy it there, or name its folder with --targets."
+            f"Target '{path}' is missing; render or copy it there, or name the folder that has it with "
+            f"--targets."
         )
     try:
         pixels, channels = read_float_image(path)

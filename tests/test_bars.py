@@ -38,5 +38,10 @@ def test_quiet(monkeypatch, capfd):
     assert lines(monkeypatch, capfd, work, quiet=True) == []
 
 
-def test_what_is_tracked_is_told_too(monkeypatch, capfd):
-    assert lines(monkeypatch, capfd, lambda progress, now: list(progress.track(range(3), total=3)))
+def test_each_of_many_is_told_too(monkeypatch, capfd):
+    def work(progress, now):
+        for _ in progress.each(range(50), 50):
+            now[0] += 2.0
+
+    found = lines(monkeypatch, capfd, work)
+    assert [line[:17] for line in found] == [f"converting {count:>2}/50 " for count in (1, 16, 31, 46)]

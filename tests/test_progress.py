@@ -45,6 +45,17 @@ def test_without_a_terminal_a_stage_says_where_it_is(monkeypatch: pytest.MonkeyP
     ]
 
 
+def test_without_a_terminal_rendering_of_targets_is_told_too(monkeypatch: pytest.MonkeyPatch, capfd):
+    now = [0.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    with Progress() as progress, progress.stage("targets", None):
+        for done in range(48):
+            now[0] += 20.0
+            progress.reference(done + 1, 48)
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[:3] == [f"targets: {done}/48 rendered" for done in (1, 3, 5)] and len(lines) == 25
+
+
 def test_a_quiet_warning_is_one_of_python():
     progress = Progress(quiet=True)
     with pytest.warns(UserWarning, match="no alpha"):

@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from ..bars import Bars
 from ..command_line import run_command
 from ..errors import UserError
 from ..evaluation import IMAGE_SCORES, Scores
@@ -89,15 +90,18 @@ def _compare(given: _Arguments) -> dict:
             raise UserError("--sensors names other views than the fit's; give their images with --targets.")
         if given.envmap and not given.targets:
             raise UserError("--envmap relights the fit; give the images under that light with --targets.")
-        return compare_fit(
-            given.first,
-            targets=given.targets,
-            sensors=given.sensors,
-            envmap=given.envmap,
-            mesh=given.mesh,
-            spp=given.spp,
-            errors=given.output,
-        )
+        with Bars(transient=True) as bars:
+            task = bars.add_task("views")
+            return compare_fit(
+                given.first,
+                targets=given.targets,
+                sensors=given.sensors,
+                envmap=given.envmap,
+                mesh=given.mesh,
+                spp=given.spp,
+                errors=given.output,
+                progress=lambda done, total: bars.update(task, completed=done, total=total),
+            )
     for name in ("targets", "sensors", "envmap", "mesh"):
         if getattr(given, name):
             raise UserError(f"--{name} is for fits only; leave it out, or leave out '{given.second}'.")

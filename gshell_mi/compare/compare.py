@@ -94,31 +94,28 @@ def compare_fit(
     references = [
         load_target(targets / f"{camera.id()}.exr", *camera.film().crop_size()).rgba for camera in cameras
     ]
+    meshes = [read_mesh(path) for path in (folder / "mesh.ply", Path(mesh))] if mesh else []
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
-    images = []
-    for number, camera in enumerate(cameras):
+    images, views = [], {}
+    for number, (camera, reference) in enumerate(zip(cameras, references, strict=True)):
         image = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=number))
         if image.shape[2] != 4:
             raise UserError(f"Sensor '{camera.id()}' has a film without alpha; set its pixel_format to rgba.")
         images.append(image)
+        views[camera.id()] = _score(camera.id(), image, reference, errors)
         if progress:
             progress(number + 1, len(cameras))
-    names = [camera.id() for camera in cameras]
-    views = {
-        name: _score(name, image, reference, errors)
-        for name, image, reference in zip(names, images, references, strict=True)
-    }
     result = {"views": views, "mean": mean_scores(views.values())}
     if envmap:
         scale = albedo_scale(images, references)
         factors = np.append(scale, 1.0)
         scaled = {
             name: image_scores(image * factors, reference)[0]
-            for name, image, reference in zip(names, images, references, strict=True)
+            for name, image, reference in zip(views, images, references, strict=True)
         }
         result |= {"mean_albedo_scaled": mean_scores(scaled.values()), "albedo_scale": scale.tolist()}
-    if mesh:
-        result |= compare_meshes(folder / "mesh.ply", mesh)
+    if meshes:
+        result["mesh"] = mesh_scores(*meshes)
     return result
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from ..command_line import run_command
-from .asset import AssetConfig, write_asset
+from .asset import NO_ATLAS, AssetConfig, write_asset
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _export(given: _Arguments) -> None:
     report = write_asset(given.output, given.config)
-    atlas = f"{report['charts']} charts" if report["charts"] else "colours at the vertices, no UV atlas"
-    print(f"{given.output / 'mesh.glb'}: {report['faces']} faces, {atlas}")
+    print(f"{given.output / 'mesh.glb'}: {report['faces']} faces, {report['charts']} charts")
+    if not report["charts"] and given.config.unwrap_seconds:
+        print(f"warning: {NO_ATLAS}", file=sys.stderr)
     if "remeshed_faces" in report:
         print(
             f"{given.output / 'remeshed.ply'}: {report['remeshed_faces']} faces, worst quality "

@@ -1,12 +1,21 @@
-"""The process in which xatlas runs: ``python _unwrap.py MESH.npz ATLAS.npz``. Imports nothing else."""
+"""The process in which xatlas runs: ``python _unwrap.py MESH.npz ATLAS.npz SECONDS``.
+
+It imports nothing else.
+"""
 
 import sys
 
 import numpy as np
 
 
-def main(given: str, found: str) -> None:
+def main(given: str, found: str, seconds: str) -> None:
     import xatlas
+
+    if sys.platform != "win32":
+        import resource
+
+        # Of the processors: a busy machine is no reason to go without textures.
+        resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 1))
 
     with np.load(given) as arrays:
         atlas = xatlas.Atlas()

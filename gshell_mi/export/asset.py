@@ -35,6 +35,12 @@ _OBJ_FILES = (
 #: Bytes that a texel takes: its colour, roughness, metallic and normal, and what they are baked from.
 _PER_TEXEL = 100
 
+#: What to say of an object without textures.
+NO_ATLAS = (
+    "mesh.glb has its colours at the vertices and no textures: its UV atlas took longer than "
+    "--unwrap-seconds, or failed; run gshell_mi.export again with more of them, or with a lower --face-count."
+)
+
 #: Seconds; what waits for another process counts no longer.
 _LONGEST = 1_000_000
 
@@ -49,7 +55,7 @@ class AssetConfig:
     texture_size: int = 1024
     """Pixels per side of the textures."""
     unwrap_seconds: float = 60.0
-    """Time limit of the UV atlas; beyond it the colours go to the vertices."""
+    """Time limit of the UV atlas, of the processors; beyond it the colours go to the vertices."""
     obj: bool = False
     """Also write mesh.obj with its material and textures."""
     remesh: float | None = None
@@ -118,6 +124,8 @@ def _write(folder: Path, fine: FittedMesh, turn: np.ndarray, config: AssetConfig
     atlas = unwrap(vertices, faces, texture_size=config.texture_size, seconds=config.unwrap_seconds)
     normals = vertex_normals(vertices, faces)
     report = {"faces": len(faces), "charts": atlas.charts if atlas else 0}
+    if config.remesh is not None:  # first, as its settings may not suit the mesh
+        report |= _write_remeshed(folder, read_ply(folder / "mesh.ply"), config)
     if atlas:
         vertices, normals, faces = vertices[atlas.source], normals[atlas.source], atlas.faces
         tangents = vertex_tangents(vertices, normals, faces, atlas.uv)
@@ -152,8 +160,6 @@ def _write(folder: Path, fine: FittedMesh, turn: np.ndarray, config: AssetConfig
         if config.obj:
             with replacing(folder / "mesh.obj") as partial:
                 trimesh.Trimesh(vertices, faces, process=False).export(partial)
-    if config.remesh is not None:
-        report |= _write_remeshed(folder, read_ply(folder / "mesh.ply"), config)
     return report
 
 

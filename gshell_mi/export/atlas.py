@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import tempfile
@@ -40,7 +41,7 @@ def unwrap(
     padding: int = 4,
     seconds: float = 60.0,
 ) -> Atlas | None:
-    """Unwraps a mesh without overlaps; None if that fails or takes longer than ``seconds``.
+    """Unwraps a mesh without overlaps; None if that fails or takes longer than ``seconds`` of the processors.
 
     xatlas is given slightly smoothed positions: noise of the surface's normals would scatter it over hundreds
     of charts, and an atlas of the smoothed mesh is one of the mesh too.
@@ -50,8 +51,11 @@ def unwrap(
         faces: (F, 3).
         texture_size: pixels per side of the texture that is wanted.
         padding: pixels between charts.
-        seconds: time limit.
+        seconds: time limit, less than a second more or less; 0: nothing is tried. Of the clock where the
+            system does not limit a process's time (Windows).
     """
+    if not seconds:
+        return None
     with tempfile.TemporaryDirectory() as folder:
         given, found = Path(folder) / "mesh.npz", Path(folder) / "atlas.npz"
         np.savez(
@@ -61,9 +65,11 @@ def unwrap(
             texture_size=texture_size,
             padding=padding,
         )
-        command = [sys.executable, str(Path(__file__).with_name("_unwrap.py")), str(given), str(found)]
+        limit = str(math.ceil(seconds))
+        command = [sys.executable, str(Path(__file__).with_name("_unwrap.py")), str(given), str(found), limit]
         try:
-            subprocess.run(command, check=True, timeout=seconds, capture_output=True)
+            on_clock = seconds if sys.platform == "win32" else None
+            subprocess.run(command, check=True, timeout=on_clock, capture_output=True)
             with np.load(found) as arrays:
                 atlas = Atlas(
                     arrays["source"].astype(np.int64),

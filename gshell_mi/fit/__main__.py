@@ -35,7 +35,7 @@ class _Arguments:
     """Replace an earlier fit in the output folder, once the new one is complete; other files are left
     alone."""
     effort: Effort = "normal"
-    """How much work the fit is. preview is a rough result in half a minute: a coarser lattice, fewer steps
+    """How much work the fit is. preview is a rough result in about a minute: a coarser lattice, fewer steps
     and samples, no refinement, no mesh.glb or report.html. thorough takes twice as many steps of every stage,
     and ends on twice as many cells per side if it starts from a radiance volume. What else is given on the
     command line still counts."""
@@ -86,6 +86,7 @@ def _fit(given: _Arguments) -> None:
         if given.viewer:
             viewer = stack.enter_context(Viewer(given.viewer_port))
             print(f"live view: {viewer.url}", file=sys.stderr)
+        report = not (given.no_report or given.effort == "preview")
         result = fit_scene(
             given.scene,
             given.output,
@@ -93,7 +94,7 @@ def _fit(given: _Arguments) -> None:
             config=given.config,
             resume=given.resume,
             overwrite=given.overwrite,
-            report=not (given.no_report or given.effort == "preview"),
+            report=report,
             quiet=given.quiet,
             observer=viewer,
         )
@@ -105,6 +106,8 @@ def _fit(given: _Arguments) -> None:
         f"{result.metrics['psnr_training']:.2f} dB on the training views, "
         f"{result.metrics['seconds']['total']:.0f} s"
     )
+    if not report and not given.quiet:
+        print(f"gshell-report {result.output} makes mesh.glb and report.html of it", file=sys.stderr)
     if "held_out" in result.metrics:
         print(f"held-out views: {scores_line(result.metrics['held_out'])}")
     if "held_out_laid" in result.metrics:

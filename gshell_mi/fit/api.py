@@ -13,7 +13,7 @@ import numpy as np
 from .. import extras  # noqa: F401 registers what settings may name
 from ..errors import UserError
 from ..export import FitFolder, export_fit, write_metrics
-from ..export.asset import write_asset
+from ..export.asset import NO_ATLAS, write_asset
 from ..interrupt import Interrupt
 from ..memory import GIB, free_memory_of_variant, peak_memory
 from ..progress import Progress
@@ -23,7 +23,7 @@ from ..scene_inputs import scene_inputs
 from .bookkeeping.checkpoint import Checkpoint
 from .bookkeeping.fingerprint import check_fingerprint, fingerprint
 from .bookkeeping.observer import Observer
-from .config import FitConfig, default_output
+from .config import EFFORTS, FitConfig, default_output
 from .fitted import Fitted
 from .joint.depth import check_depth
 from .lattices import Lattices
@@ -171,12 +171,26 @@ def _check_inputs(fit: Fit, checkpoint: Checkpoint, resume: bool) -> None:
 
 
 def _check_settings(before: dict[str, Any], now: dict[str, Any]) -> None:
-    for name, value in now.items():
-        if before.get(name) != value and name != "checkpoint_seconds":
-            raise UserError(
-                f"The checkpoint was made with {name} = {before.get(name)}, not {value}; "
-                f"resume with the same settings or start again with --overwrite."
-            )
+    changed = {name: value for name, value in now.items() if before.get(name) != value}
+    changed.pop("checkpoint_seconds", None)
+    if not changed:
+        return
+    name, value = next(iter(changed.items()))
+    told = f"{name} = {before.get(name)}, not {'the default' if value is None else value}"
+    if (effort := _effort_of(before)) != (given := _effort_of(now)):
+        told = f"--effort {effort}, not {given}"
+    raise UserError(
+        f"The checkpoint was made with {told}; resume with the same settings or start again with --overwrite."
+    )
+
+
+def _effort_of(settings: dict[str, Any]) -> str:
+    """The effort whose settings these are, or nearly are."""
+
+    def differing(effort: str) -> int:
+        return sum(settings.get(name) != value for name, value in EFFORTS[effort].settings().items())
+
+    return min(EFFORTS, key=differing)
 
 
 def _export(fit: Fit, surface: Surface, runner: Runner, memory: _Memory, report: bool) -> dict:
@@ -219,7 +233,8 @@ def _write_documents(runner: Runner) -> None:
     """The asset and the report; for want of them a fit is not lost."""
     try:
         with runner.progress.stage("mesh.glb", None), runner.timed("asset"):
-            write_asset(runner.output)
+            if not write_asset(runner.output)["charts"]:
+                runner.progress.warn(NO_ATLAS)
         with runner.progress.stage("report", None), runner.timed("report"):
             write_report(runner.output)
     except UserError as error:

@@ -177,7 +177,7 @@ class FitConfig:
 #: How much work a fit is.
 Effort = Literal["preview", "normal", "thorough"]
 
-#: Less of everything, but for the steps that openings need: a rough result in half a minute.
+#: Less of everything, but for the steps that openings need: a rough result in about a minute.
 _PREVIEW = {
     "resolution": 48,
     "iterations": 70,
@@ -197,6 +197,7 @@ _PREVIEW = {
     "texture.rounds": 1,
     "joint.color_hold": 0.0,
     "openings.revise": False,
+    "poses": "keep",
 }
 
 #: Twice as many steps of every stage, and twice as fine an end of what is too thin for hulls.

@@ -46,7 +46,7 @@ def _turntable(given: _Arguments) -> None:
     frames = render_turntable(given.folder, given.config, envmap=given.envmap)
     columns = (TextColumn("turntable"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Bars(*columns, quiet=given.quiet) as progress:
-        tracked = progress.track(frames, total=given.config.frames)
+        tracked = progress.each(frames, given.config.frames)
         files = write_video(tracked, given.output or given.folder / "turntable.mp4", given.config.fps)
     print(*files, sep="\n")
 

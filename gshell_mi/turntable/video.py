@@ -32,6 +32,10 @@ def write_video(frames: Iterable[np.ndarray], path: Path, fps: float, *, gif: bo
         raise UserError(
             f"The name of the film '{str(path)[:80]}' {trouble}; give one such as turntable.mp4 with -o."
         )
+    if path.suffix.lower() not in ("", ".mp4"):
+        raise UserError(
+            f"The film '{str(path)[:80]}' would be an MP4; give a name that ends in .mp4 with -o."
+        )
     path = path.with_suffix(".mp4")
     files = [path, path.with_suffix(".gif")] if gif else [path]
     try:

@@ -177,6 +177,15 @@ def test_remeshed(asset):
     assert topology(mesh.vertices, mesh.faces).boundary_loops == 1
 
 
+def test_an_edge_length_that_does_not_suit_costs_nothing(tmp_path):
+    write_fit(tmp_path, open_sphere(2))
+    write_asset(tmp_path, AssetConfig(unwrap_seconds=0.0))
+    before = (tmp_path / "mesh.glb").read_bytes()
+    with pytest.raises(UserError, match="does not suit an object of size"):
+        write_asset(tmp_path, AssetConfig(face_count=100, unwrap_seconds=0.0, remesh=50.0))
+    assert (tmp_path / "mesh.glb").read_bytes() == before
+
+
 def test_colours_at_the_vertices_without_an_atlas(tmp_path, validate):
     write_fit(tmp_path, open_sphere(2))
     report = write_asset(tmp_path, AssetConfig(unwrap_seconds=0.0, obj=True))

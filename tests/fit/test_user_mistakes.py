@@ -492,6 +492,11 @@ def test_resume_with_other_views_held_out(told, stopped):
     )
 
 
+def test_resume_with_another_effort(told, stopped):
+    found = told("--resume", "--effort", "thorough")
+    assert "was made with --effort" in found and "not thorough; resume with the same settings" in found
+
+
 def test_resume_with_other_settings(told, stopped):
     assert "was made with render.max_depth = 2, not 3" in told("--resume", "--render.max-depth", "3")
 

@@ -245,3 +245,11 @@ def test_mistakes(folder, tmp_path, capsys, arguments, message):
     assert main([argument.format(**places) for argument in arguments] + ["--quiet"]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and message in error and error.count("\n") == 1
+
+
+def test_a_film_that_would_be_none(tmp_path):
+    """Nothing is written beside it."""
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match=r"would be an MP4; give a name that ends in \.mp4"):
+        write_video([], tmp_path / "notes.txt", 12)
+    assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]

@@ -44,7 +44,8 @@ def read_capture(
         raise UserError(
             f"'{source}' is no {'capture of the format ' + name if name else 'known capture'}: a folder with "
             f"transforms*.json (NeRF), cameras*.npz (IDR, NeuS), sparse/0 (COLMAP), poses_bounds.npy (LLFF) "
-            f"or an XML file of Mitsuba sensors is needed; Metashape and RealityScan export to COLMAP."
+            f"or an XML file of Mitsuba sensors is needed, or mere photographs or a video; Metashape and "
+            f"RealityScan export to COLMAP."
         )
     if opencv_axes and name != "nerf":
         raise UserError(
