@@ -94,7 +94,7 @@ def compare_fit(
     references = [
         load_target(targets / f"{camera.id()}.exr", *camera.film().crop_size()).rgba for camera in cameras
     ]
-    meshes = [read_mesh(path) for path in (folder / "mesh.ply", Path(mesh))] if mesh else []
+    surfaces = (read_mesh(folder / "mesh.ply"), read_mesh(mesh)) if mesh else None
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
     images, views = [], {}
     for number, (camera, reference) in enumerate(zip(cameras, references, strict=True)):
@@ -114,8 +114,8 @@ def compare_fit(
             for name, image, reference in zip(views, images, references, strict=True)
         }
         result |= {"mean_albedo_scaled": mean_scores(scaled.values()), "albedo_scale": scale.tolist()}
-    if meshes:
-        result["mesh"] = mesh_scores(*meshes)
+    if surfaces:
+        result["mesh"] = mesh_scores(*surfaces)
     return result
 
 
