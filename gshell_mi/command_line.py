@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import io
+import itertools
+import os
+import re
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stderr
+from difflib import get_close_matches
 from functools import partial
 from typing import TypeVar
+from unittest.mock import patch
 
 import tyro
 
 from .doctor import ensure_variant
+from .errors import UserError
 from .interrupt import Interrupt
 from .kernel_cache import kernel_cache_problem
 from .streams import with_streams
@@ -55,7 +63,7 @@ def run_command(
             description=description,
             config=(tyro.conf.FlagCreatePairsOff,),
         )
-        parsed = parse() if default is None else parse(default=default)
+        parsed = _parsed(parse if default is None else partial(parse, default=default), name)
         with Interrupt() as interrupt:
             try:
                 if (variant := getattr(parsed, "variant", None)) is not None:
@@ -76,3 +84,36 @@ def run_command(
         return 130
 
     return with_streams(run)
+
+
+def _parsed(parse: Callable[[], Arguments], name: str) -> Arguments:
+    """What a parser of tyro reads.
+
+    Raises:
+        UserError: words that it does not understand; it would fill a box with them.
+    """
+    told = io.StringIO()
+    try:
+        with redirect_stderr(told):
+            return parse()
+    except SystemExit as stop:
+        if stop.code != 2:
+            raise
+    try:  # once more, without wrapped lines
+        with redirect_stderr(told := io.StringIO()), patch.dict(os.environ, COLUMNS="10000"):
+            return parse()
+    except SystemExit:
+        raise UserError(_sentence_of(told.getvalue(), name)) from None
+
+
+def _sentence_of(box: str, name: str) -> str:
+    """What is wrong and how to mend it, of a box that tyro prints."""
+    lines = [re.sub(r"[^\x20-\x7e]", "", line).strip() for line in box.splitlines()[1:-1]]
+    wrong = " ".join(itertools.takewhile(bool, lines)).rstrip(".")
+    helped = f"python -m gshell_mi.{name} --help lists all options"
+    unknown = re.match(r"Unrecognized options: ([^,]+)", wrong)
+    if not unknown:
+        return f"{wrong}; {helped}."
+    known = [line.split()[0] for line in lines if line.startswith("--")]
+    near = get_close_matches(unknown[1], known, 1)
+    return f"{unknown[1]} is no option; " + (f"did you mean {near[0]}? " if near else "") + f"{helped}."

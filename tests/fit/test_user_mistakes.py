@@ -371,10 +371,24 @@ def test_given_fields_without_a_surface(told, scene):
     assert "air.npz' of the gshell shape" in told() and "hold no surface" in told()
 
 
-def test_flag_that_does_not_exist(capfd):
-    with pytest.raises(SystemExit) as stop:
-        main(["scene.xml", "--no-such-flag"])
-    assert stop.value.code == 2 and "no-such-flag" in capfd.readouterr().err
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("scene.xml --no-such-flag", "--no-such-flag is no option; "),
+        ("scene.xml --iteration 5", "--iteration is no option; did you mean --iterations? "),
+        ("scene.xml --iterations many", "Error parsing --iterations: invalid literal for int() .*'many'; "),
+        (
+            "scene.xml --effort quick",
+            r"invalid choice 'quick' for argument '--effort'. Expected one of .*\); ",
+        ),
+        ("scene.xml --render.views", "Missing value for argument '--render.views'. Expected 1 values; "),
+        ("", "Missing from python -m gshell_mi.fit: PATH The fit scene: .*; "),
+    ],
+)
+def test_words_that_are_not_understood(words, sentence, capfd):
+    assert main(words.split()) == 2
+    told = capfd.readouterr().err
+    assert re.fullmatch(f"error: {sentence}python -m gshell_mi.fit --help lists all options.\n", told)
 
 
 # --- the output folder
