@@ -84,6 +84,9 @@ def _row(field: dataclasses.Field, metadata: str, prefix: str, text: str) -> str
         name = f"{short[1]}, {name}"
     if "positional" in metadata.lower():
         name = field.name.upper()
+    if field.default is True:
+        stage, dot, last = name.removeprefix("--").rpartition(".")
+        return f"| `--{stage}{dot}no-{last}` | off | Switches off: {text[:1].lower()}{text[1:]} |"
     return f"| `{name}` | {_default(field)} | {text} |"
 
 
@@ -92,7 +95,7 @@ def _default(field: dataclasses.Field) -> str:
         return ""
     if field.default is False:
         return "off"
-    return f"`{'on' if field.default is True else field.default}`"
+    return f"`{field.default}`"
 
 
 def field_texts(arguments: type) -> dict[str, str]:

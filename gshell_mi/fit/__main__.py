@@ -44,7 +44,7 @@ class _Arguments:
     quiet: bool = False
     """No progress bars."""
     viewer: bool = False
-    """Show the fit in the browser while it runs; needs the extra: pip install gshell_mi[viewer]."""
+    """Show the fit in the browser while it runs; needs the extra: pip install 'gshell_mi[viewer]'."""
     viewer_port: int = 8080
     """Port of --viewer; if it is taken, the next one that is free."""
     config: Annotated[FitConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FitConfig)

@@ -377,10 +377,7 @@ def test_given_fields_without_a_surface(told, scene):
         ("scene.xml --no-such-flag", "--no-such-flag is no option; "),
         ("scene.xml --iteration 5", "--iteration is no option; did you mean --iterations\\? "),
         ("scene.xml --iterations many", "Error parsing --iterations: .*'many'; "),
-        (
-            "scene.xml --effort quick",
-            r"invalid choice 'quick' for argument '--effort'. Expected one of .*; ",
-        ),
+        ("scene.xml --effort quick", r"invalid choice 'quick' for argument '--effort'. Expected one of .*; "),
         ("scene.xml --render.views", "Missing value for argument '--render.views'. Expected 1 values; "),
         ("", "Missing from python -m gshell_mi.fit: PATH The fit scene: .*; "),
     ],
