@@ -17,7 +17,9 @@ _ROW, _CHARACTERS = 14, 70
 
 
 def curves(log: Path) -> list[str]:
-    """One SVG per quantity: the losses of each stage on a logarithmic axis, and PSNR. Empty without a log.
+    """One SVG per quantity: the losses of each stage on a logarithmic axis, and PSNR, with running means.
+
+    There are none without a log.
 
     Lines that no fit wrote are left out, and names are escaped.
     """
@@ -66,10 +68,12 @@ def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic
     if not points:
         return ""
     x_low, x_high = (f(np.concatenate([x for x, _ in points.values()])) for f in (np.min, np.max))
-    y_low, y_high = (f(np.concatenate([y for _, y in points.values()])) for f in (np.min, np.max))
+    # Where a loss starts from nothing, it would press all others together.
+    y_low = min(min(np.median(y), y[-1]) for _, y in points.values())
+    y_high = max(y.max() for _, y in points.values())
     x_span, y_span = max(x_high - x_low, 1), max(y_high - y_low, 1e-6)
     across = lambda x: _LEFT + (x - x_low) / x_span * (_WIDTH - _LEFT - _RIGHT)  # noqa: E731
-    down = lambda y: _TOP + (y_high - y) / y_span * (_HEIGHT - _TOP - _BOTTOM)  # noqa: E731
+    down = lambda y: _TOP + (y_high - np.maximum(y, y_low)) / y_span * (_HEIGHT - _TOP - _BOTTOM)  # noqa: E731
     legend = _legend(list(points)) if len(points) > 1 else []
     height = _HEIGHT + _ROW * len(legend)
     parts = [
@@ -86,9 +90,24 @@ def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic
         parts.append(f'<text x="{across(x):.1f}" y="{_HEIGHT - 8}" text-anchor="middle">{x:.0f}</text>')
     for number, (name, (x, y)) in enumerate(points.items()):
         color = _COLORS[number % len(_COLORS)]
-        path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across(x), down(y), strict=True))
-        parts.append(f'<polyline points="{path}" stroke="{color}"><title>{escape(name)}</title></polyline>')
+        smooth = _running_mean(y)
+        lines = [(smooth, "")] if (smooth == y).all() else [(y, ' opacity="0.3"'), (smooth, "")]
+        for values, look in lines:
+            path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across(x), down(values), strict=True))
+            told = f"<title>{escape(name)}</title>"
+            parts.append(f'<polyline points="{path}" stroke="{color}"{look}>{told}</polyline>')
     return "".join([*parts, *legend, "</svg>"])
+
+
+def _running_mean(values: np.ndarray) -> np.ndarray:
+    """Over a tenth of all: steps look at different views, and jump. A few values stay as they are."""
+    reach = len(values) // 20
+    if not reach:
+        return values
+    sums = np.cumsum(np.insert(values, 0, 0))
+    index = np.arange(len(values))
+    first, end = np.maximum(index - reach, 0), np.minimum(index + reach + 1, len(values))
+    return (sums[end] - sums[first]) / (end - first)
 
 
 def _legend(names: list[str]) -> list[str]:

@@ -34,6 +34,21 @@ def test_curves(tmp_path):
     assert "polyline" not in "".join(curves(log))
 
 
+def test_a_loss_that_starts_from_nothing_does_not_press_the_others(tmp_path):
+    """And what jumps from step to step has a running mean."""
+    log = tmp_path / "log.jsonl"
+    steps = [
+        {"stage": "joint", "iteration": i, "loss": 0.1 + 0.05 * (i % 2), "light_grey": 1e-8 if i < 9 else 0.1}
+        for i in range(200)
+    ]
+    log.write_text("".join(json.dumps(step) + "\n" for step in steps))
+    jumping, mean, _, _ = (
+        np.array([p.split(",") for p in points.split()], float)[:, 1]
+        for points in re.findall(r'points="([^"]*)"', curves(log)[0])
+    )
+    assert np.ptp(jumping) > 100 and np.ptp(mean[20:-20]) < 0.1 * np.ptp(jumping)
+
+
 HOSTILE = [
     "garbage",
     "",
