@@ -68,8 +68,9 @@ def _plot(title: str, series: dict[str, list[tuple[int, float]]], *, logarithmic
     if not points:
         return ""
     x_low, x_high = (f(np.concatenate([x for x, _ in points.values()])) for f in (np.min, np.max))
-    # Where a loss starts from nothing, it would press all others together.
-    y_low = min(min(np.median(y), y[-1]) for _, y in points.values())
+    # A loss that starts from nothing would press all others together.
+    told = [y[len(y) // 2 :] if logarithmic else y for _, y in points.values()]
+    y_low = min(y.min() for y in told)
     y_high = max(y.max() for _, y in points.values())
     x_span, y_span = max(x_high - x_low, 1), max(y_high - y_low, 1e-6)
     across = lambda x: _LEFT + (x - x_low) / x_span * (_WIDTH - _LEFT - _RIGHT)  # noqa: E731
