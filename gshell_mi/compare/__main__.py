@@ -18,6 +18,9 @@ from ..evaluation import IMAGE_SCORES, Scores
 from ..evaluation.scores_file import check_scores_file, write_scores
 from ..wording import counted
 
+#: Characters of a line in a file or a pipe, where no heading has to be cut.
+_WIDE = 160
+
 _MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 
 
@@ -115,6 +118,8 @@ def _compare(given: _Arguments) -> dict:
 
 def _show(result: dict) -> None:
     console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = _WIDE
     if "mean" in result:
         table = Table("", *IMAGE_SCORES)
         for name, scores in result["views"].items():
