@@ -41,10 +41,11 @@ class Poses:
         config, mesh = self.config, fit.scene.subject.surface_of(surface.fields).to_numpy()[:2]
         if not (fit.pixels.has_alpha and len(mesh[1])):
             return surface
-        laying = Laying(
-            mesh, fit.views, fit.scene.targets, config, cell=fit.cell(surface), seed=fit.config.seed
-        )
-        every, each = laying.verdicts()
+        with steps.task("verdict"):
+            laying = Laying(
+                mesh, fit.views, fit.scene.targets, config, cell=fit.cell(surface), seed=fit.config.seed
+            )
+            every, each = laying.verdicts()
         corrections, kept, told = laying.alignment.corrections, False, every.facts()
         for moving in (np.full(len(fit.views), every.accepted[0]), each.accepted):
             if not kept and moving.any():
