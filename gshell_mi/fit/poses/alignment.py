@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -19,6 +19,10 @@ _FIRST_GUESS = np.radians(0.3)
 
 #: Side of the squares, in pixels, that images are parted into two halves by; residuals are alike within one.
 _SQUARE = 24
+
+#: Squares of an image before their spread tells of a single camera: of four, two standard errors are no rare
+#: accident, and small images of exact cameras would be corrected.
+_SQUARES = 12
 
 #: Residuals beyond so many times their median are taken for those of something else.
 _OUTLIER = 1.5
@@ -164,7 +168,9 @@ class Alignment:
                     total[view] += np.bincount(square, errors, columns * rows)
                 rays[view] += np.bincount(square, each.weights, columns * rows)
         every = verdict_of(*(values.sum(axis=1)[None] for values in (rays, before, after)))
-        return every, verdict_of(rays, before, after)
+        each = verdict_of(rays, before, after)
+        few = (rays > 0).sum(axis=1) < _SQUARES
+        return every, replace(each, noise=np.where(few, np.inf, each.noise))
 
     def _jacobian(self, evidence: Evidence, view: int) -> np.ndarray:
         """(K, 6) derivatives of the values, in radians and parts of the distance."""
