@@ -12,7 +12,6 @@ from contextlib import redirect_stderr
 from difflib import get_close_matches
 from functools import partial
 from typing import TypeVar
-from unittest.mock import patch
 
 import tyro
 
@@ -92,18 +91,22 @@ def _parsed(parse: Callable[[], Arguments], name: str) -> Arguments:
     Raises:
         UserError: words that it does not understand; it would fill a box with them.
     """
-    told = io.StringIO()
     try:
-        with redirect_stderr(told):
+        with redirect_stderr(io.StringIO()):
             return parse()
     except SystemExit as stop:
         if stop.code != 2:
             raise
+    columns, os.environ["COLUMNS"] = os.environ.get("COLUMNS"), "10000"
     try:  # once more, without wrapped lines
-        with redirect_stderr(told := io.StringIO()), patch.dict(os.environ, COLUMNS="10000"):
+        with redirect_stderr(told := io.StringIO()):
             return parse()
     except SystemExit:
         raise UserError(_sentence_of(told.getvalue(), name)) from None
+    finally:
+        del os.environ["COLUMNS"]
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
 
 
 def _sentence_of(box: str, name: str) -> str:

@@ -119,13 +119,15 @@ def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
 
 
 def _write(folder: Path, fine: FittedMesh, turn: np.ndarray, config: AssetConfig) -> dict:
+    # First, as its settings may not suit the mesh.
+    remeshed = (
+        {} if config.remesh is None else _write_remeshed(folder, fine, config.remesh, config.min_quality)
+    )
     fine = FittedMesh(fine.vertices @ turn.T, fine.faces, fine.normals @ turn.T, fine.attributes)
     vertices, faces = _simplified(fine, config.face_count)
     atlas = unwrap(vertices, faces, texture_size=config.texture_size, seconds=config.unwrap_seconds)
     normals = vertex_normals(vertices, faces)
-    report = {"faces": len(faces), "charts": atlas.charts if atlas else 0}
-    if config.remesh is not None:  # first, as its settings may not suit the mesh
-        report |= _write_remeshed(folder, read_ply(folder / "mesh.ply"), config)
+    report = {"faces": len(faces), "charts": atlas.charts if atlas else 0} | remeshed
     if atlas:
         vertices, normals, faces = vertices[atlas.source], normals[atlas.source], atlas.faces
         tangents = vertex_tangents(vertices, normals, faces, atlas.uv)
@@ -202,11 +204,8 @@ def _simplified(fine: FittedMesh, face_count: int) -> tuple[np.ndarray, np.ndarr
         return fine.vertices, fine.faces
 
 
-def _write_remeshed(folder: Path, fine: FittedMesh, config: AssetConfig) -> dict:
-    assert config.remesh is not None
-    vertices, faces = remesh(
-        fine.vertices, fine.faces, config.remesh, resample_boundary=True, min_quality=config.min_quality
-    )
+def _write_remeshed(folder: Path, fine: FittedMesh, edge: float, min_quality: float) -> dict:
+    vertices, faces = remesh(fine.vertices, fine.faces, edge, resample_boundary=True, min_quality=min_quality)
     normals = vertex_normals(vertices, faces)
     source = project(fine, vertices, normals)
     attributes = {name: source.interpolate(fine.faces, values) for name, values in fine.attributes.items()}
