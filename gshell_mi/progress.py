@@ -1,23 +1,22 @@
 """Progress on the terminal: one bar per stage with loss, PSNR, seconds per step and time left.
 
-Without a terminal, as in a log file, a stage prints a line after its first step, at its end, and every half a
+Without a terminal, as in a log file, a stage prints a line when it has begun, at its end, and every half a
 minute.
 """
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 
-from rich.console import Console
-from rich.progress import BarColumn, SpinnerColumn, TextColumn
-from rich.progress import Progress as RichProgress
+from rich.progress import BarColumn, ProgressColumn, SpinnerColumn, Task, TextColumn
+from rich.table import Column
+from rich.text import Text
 
-from .bars import PAUSE
+from .bars import Bars
 
 #: Steps whose mean duration predicts the time left; old ones say little about a stage that gets slower.
 _WINDOW = 20
@@ -33,18 +32,15 @@ class Progress:
     """
 
     def __init__(self, *, quiet: bool = False):
-        self._console = Console(stderr=True, quiet=quiet, highlight=False)
         self._quiet, self.warnings = quiet, list[str]()
-        self._in_lines = not quiet and not self._console.is_terminal
-        self._bars = RichProgress(
+        self._bars = Bars(
             SpinnerColumn(),
-            TextColumn("{task.description:<18}"),
+            TextColumn("{task.description}:", table_column=Column(min_width=19)),
             BarColumn(bar_width=24),
-            TextColumn("{task.fields[detail]}"),
-            console=self._console,
-            disable=quiet or self._in_lines,
+            _Detail(),
+            quiet=quiet,
         )
-        self._reference, self._told = None, -math.inf
+        self._console, self._reference = self._bars.console, None
 
     def __enter__(self) -> Progress:
         self._bars.start()
@@ -71,10 +67,9 @@ class Progress:
         task = self._bars.add_task(name, total=total, completed=done, detail="")
         durations: deque[float] = deque(maxlen=_WINDOW)
         begin = last = time.monotonic()
-        shown = begin - PAUSE
 
         def advance(values: Mapping[str, float] | None = None) -> None:
-            nonlocal last, done, shown
+            nonlocal last, done
             now = time.monotonic()
             durations.append(now - last)
             last = now
@@ -87,9 +82,6 @@ class Progress:
                 quality = f"  PSNR {values['psnr']:.1f} dB" if "psnr" in values else ""
                 detail = f"loss {values['loss']:.4f}{quality}  {detail}"
             self._bars.update(task, completed=done, detail=detail)
-            if now - shown >= PAUSE:
-                shown = now
-                self._line(name, detail)
 
         try:
             yield advance
@@ -98,21 +90,21 @@ class Progress:
             raise
         took = f"{time.monotonic() - begin:.1f} s"
         self._bars.update(task, total=total or 1, completed=total or 1, detail=took)
-        self._line(name, f"took {took}")
-
-    def _line(self, name: str, detail: str) -> None:
-        if self._in_lines:
-            self._console.print(f"{name}: {detail}", soft_wrap=True)
+        if self._bars.in_lines:
+            self._console.print(f"{name}: took {took}", soft_wrap=True)
 
     def reference(self, done: int, total: int) -> None:
         """Targets being rendered from a reference scene: ``done`` of ``total``."""
         if self._reference is None:
-            self._reference = self._bars.add_task("references", total=total, detail="")
+            self._reference = self._bars.add_task("targets", total=total, detail="")
         self._bars.update(self._reference, completed=done, total=total, detail=f"{done}/{total} rendered")
-        now = time.monotonic()
-        if done < total and now - self._told >= PAUSE:
-            self._told = now
-            self._line("targets", f"{done}/{total} rendered")
+
+
+class _Detail(ProgressColumn):
+    """How far a stage is; before it has said so, for how long it has been at it."""
+
+    def render(self, task: Task) -> Text:
+        return Text(task.fields["detail"] or f"{_clock(task.elapsed or 0)} so far")
 
 
 def usual_duration(durations: Collection[float]) -> float:

@@ -15,6 +15,7 @@ from PIL.PngImagePlugin import PngInfo
 from ..compat import write_mesh
 from ..errors import UserError
 from ..extraction import extract
+from ..fields.mask_distances import MaskDistances
 from ..fields.visual_hull import visual_hull
 from ..files import replacing
 from ..fit.config import FitConfig
@@ -241,9 +242,8 @@ def _hull(scene: FitScene, silhouettes: list[Silhouette]) -> mi.Scene | None:
         np.array([s.camera.center for s in seen]),
         np.array([s.camera.basis() for s in seen]),
     )
-    distance = visual_hull(
-        points, views, [s.possible for s in seen], daylight_votes=FitConfig().hull.daylight_votes
-    )
+    masks = MaskDistances(views, [s.possible for s in seen])
+    distance = visual_hull(points, masks, daylight_votes=FitConfig().hull.daylight_votes)
     sdf = np.clip(
         distance.numpy() / np.abs(np.linalg.det(np.array(scene.subject.to_world.matrix)[:3, :3])) ** (1 / 3),
         -1,

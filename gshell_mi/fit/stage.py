@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from ..fields.mask_distances import MaskDistances
 from ..light import turns_with_camera
 from ..packed_pixels import unpacked
 from ..pixels import PixelPool
@@ -61,6 +62,11 @@ class Fit:
         return [target.most_alpha for target in self.scene.targets]
 
     @cached_property
+    def masks(self) -> MaskDistances:
+        """Distances to the outlines of ``alphas``."""
+        return MaskDistances(self.views, self.alphas)
+
+    @cached_property
     def pixels(self) -> PixelPool:
         """The pixels of all views."""
         return PixelPool(self.views, self.scene.targets)
@@ -101,7 +107,7 @@ class Fit:
         Args:
             surface: that tells; of a fit as it was given.
         """
-        for pool in ("pixels", "training", "judge", "validation_judge"):
+        for pool in ("masks", "pixels", "training", "judge", "validation_judge"):
             self.__dict__.pop(pool, None)
         targets, sensors = self.scene.targets, self.scene.sensors
         if surface.gains is not None:

@@ -7,6 +7,7 @@ from scipy import ndimage
 from topology import assert_manifold, component_count, euler_characteristic
 
 from gshell_mi.extraction import extract
+from gshell_mi.fields.mask_distances import MaskDistances
 from gshell_mi.fields.visual_hull import doubting_hulls, visual_hull
 from gshell_mi.lattice import TetLattice
 from gshell_mi.views import PinholeViews
@@ -79,15 +80,13 @@ def extracted(distance: mi.Float, lattice: TetLattice):
 
 
 def hull(masks, views: PinholeViews, lattice: TetLattice, **options) -> mi.Float:
-    return visual_hull(lattice.points(mi.Float), views, masks, **options)
+    return visual_hull(lattice.points(mi.Float), MaskDistances(views, masks), **options)
 
 
 def test_hull_of_a_sphere():
     radius, lattice, views = 0.6, TetLattice(32), around(20)
-    calls = []
     masks = [coverage(views, i, sphere_hit(radius)) for i in range(len(views))]
-    distance = hull(masks, views, lattice, progress=lambda: calls.append(1))
-    assert len(calls) == 20
+    distance = hull(masks, views, lattice)
     vertices, faces = extracted(distance, lattice)
     assert (component_count(faces), euler_characteristic(faces)) == (1, 2)
     excess = (np.linalg.norm(vertices, axis=1) - radius) / lattice.spacing
@@ -129,6 +128,17 @@ def test_a_single_glimpse_of_daylight_is_not_carved():
         assert np.array_equal(distance, whole) != carved
 
 
+def test_what_is_out_of_reach_is_as_far_as_that(torus):
+    views, masks = torus
+    lattice = TetLattice(16)
+    exact = hull(masks, views, lattice).numpy()
+    reach = 0.2
+    assert (exact > 2 * reach).any() and (exact < -reach / 2).any()
+    np.testing.assert_allclose(
+        hull(masks, views, lattice, reach=reach).numpy(), np.minimum(exact, reach), atol=1e-6
+    )
+
+
 def test_an_empty_mask_leaves_nothing():
     views, lattice = around(3, size=16), TetLattice(8)
     masks = [np.zeros((16, 16))] + [coverage(views, i, sphere_hit(0.6), samples=1) for i in (1, 2)]
@@ -140,7 +150,7 @@ def test_what_no_view_frames_is_outside():
     origin, basis = look_at([0, 0, 3], size=16, fov=20)
     views = PinholeViews(("0",), np.full((1, 2), 16), origin[None], basis[None])
     points = mi.Point3f([0, 0, 0], [0, 2, 0], [0, 0, 4])  # in the frame, above it, behind the camera
-    distance = visual_hull(points, views, [np.ones((16, 16))]).numpy()
+    distance = visual_hull(points, MaskDistances(views, [np.ones((16, 16))])).numpy()
     assert distance[0] < 0 and (distance[1:] == np.inf).all()
 
 
@@ -149,10 +159,10 @@ def test_masks_that_are_not_believed():
     views = around(9)
     masks = [coverage(views, index, sphere_hit(0.5)) for index in range(9)]
     points = mi.Point3f([0.0, 0.3, 0.7], [0.0, 0.1, 0.0], [0.0, -0.2, 0.0])
-    expected = visual_hull(points, views, masks).numpy()
+    expected = visual_hull(points, MaskDistances(views, masks)).numpy()
     masks[4] = np.zeros_like(masks[4])
-    assert visual_hull(points, views, masks).numpy().min() > 0
+    assert visual_hull(points, MaskDistances(views, masks)).numpy().min() > 0
     # All points are farthest outside of the empty mask, so the next one tells.
-    believing, doubting = doubting_hulls(points, views, masks, [0, 1])
-    np.testing.assert_array_equal(believing.numpy(), visual_hull(points, views, masks).numpy())
+    believing, doubting = doubting_hulls(points, MaskDistances(views, masks), [0, 1])
+    np.testing.assert_array_equal(believing.numpy(), visual_hull(points, MaskDistances(views, masks)).numpy())
     np.testing.assert_allclose(doubting.numpy(), expected, atol=1e-6)

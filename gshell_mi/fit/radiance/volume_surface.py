@@ -11,6 +11,7 @@ from scipy import ndimage
 from ...fields import LatticeFields
 from ...fields.depth_fusion import fused_distance
 from ...fields.lattice_fields import closed_at_border
+from ...fields.mask_distances import MaskDistances
 from ...fields.visual_hull import visual_hull
 from ...lattice import Lattice
 from ...scene import FitScene
@@ -40,6 +41,7 @@ _FLOATER = 2.0
 def volume_surface(
     volume: RadianceVolume,
     scene: FitScene,
+    masks: MaskDistances,
     lattice: Lattice,
     light: np.float32,
     progress: Callable[[], None] = lambda: None,
@@ -52,6 +54,7 @@ def volume_surface(
     Args:
         volume: trained.
         scene: whose subject says where the lattice is.
+        masks: of its targets.
         lattice: whose vertices make a cube.
         light: of what was seen.
         progress: called without arguments after each view.
@@ -63,7 +66,7 @@ def volume_surface(
     cell, margin = subject.length_scale * lattice.spacing, _MARGIN
     points = mi.Transform4f(subject.to_world) @ mi.Point3f(lattice.points(mi.Float))
     alphas = [target.most_alpha for target in scene.targets]
-    distance = visual_hull(points, views, alphas).numpy()
+    distance = visual_hull(points, masks).numpy()
     depths = []
     for index, (target, alpha) in enumerate(zip(scene.targets, alphas, strict=True)):
         depth = volume.depth(index)

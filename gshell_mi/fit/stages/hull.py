@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +13,7 @@ from ...errors import UserError
 from ...fields import LatticeFields
 from ...fields.interpolation import Interpolation
 from ...fields.lattice_fields import closed_at_border
+from ...fields.mask_distances import MaskDistances
 from ...fields.thin_parts import thickened, thin_part_refinement
 from ...fields.visual_hull import doubting_hulls
 from ...lattice import CubeLattice, Lattice
@@ -25,6 +26,10 @@ from ..surface import TYPICAL_REFLECTANCE, Seen, Surface
 
 if TYPE_CHECKING:
     from ..config import FitConfig
+
+
+#: Cells outside of the hull up to which it matters how far: nothing grows by more.
+_REACH = 4.0
 
 
 @dataclass(frozen=True)
@@ -50,8 +55,8 @@ class Hull:
         Raises:
             UserError: the masks have nothing in common.
         """
-        with steps.task(total=len(fit.views)) as advance:
-            (hull,) = hulls_of(fit, fit.alphas, progress=advance)
+        with steps.task():
+            (hull,) = hulls_of(fit, fit.masks)
         if not (hull.fields.sdf < 0).any():
             raise UserError(
                 f"The masks of the targets have no common volume in the box of '{fit.scene.path}'; check "
@@ -60,17 +65,12 @@ class Hull:
         return hull
 
 
-def hulls_of(
-    fit: Fit,
-    alphas: list[np.ndarray],
-    disbelieved: Sequence[int] = (0,),
-    progress: Callable[[], object] | None = None,
-) -> list[Surface]:
+def hulls_of(fit: Fit, masks: MaskDistances, disbelieved: Sequence[int] = (0,)) -> list[Surface]:
     """Visual hulls of some masks on the early lattice, with what is too thin for that grown.
 
     Args:
-        fit: the views, the lattice and the settings.
-        alphas, disbelieved, progress: as of ``doubting_hulls``.
+        fit: the lattice and the settings.
+        masks, disbelieved: as of ``doubting_hulls``.
     """
     subject, lattice = fit.scene.subject, fit.lattices.early
     finer = thin_part_refinement(lattice.resolution)
@@ -80,11 +80,10 @@ def hulls_of(
     found = []
     for world in doubting_hulls(
         points,
-        fit.views,
-        alphas,
+        masks,
         disbelieved,
-        progress=progress,
         daylight_votes=fit.config.hull.daylight_votes,
+        reach=_REACH * cell * subject.length_scale,
     ):
         solid = np.clip(world.numpy() / subject.length_scale, -1, 1) / cell
         grown = thickened(solid.reshape((samples.stride,) * 3), finer)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ...compat import mesh_scene
+from ...fields.mask_distances import MaskDistances
 from ...packed_pixels import packed
 from ...topology import lobes
 from ..bounds import Between
@@ -91,8 +92,12 @@ class Occlusion:
 
 def _meshes(fit: Fit, ignored: list[np.ndarray], disbelieved: list[int]) -> list[Mesh]:
     """Hulls that do not believe so many masks, without the pixels that are ignored."""
-    alphas = [np.maximum(*each) for each in zip(fit.alphas, ignored, strict=True)]
-    return [template_of(fit.scene.subject, hull).closed for hull in hulls_of(fit, alphas, disbelieved)]
+    masks = fit.masks
+    if any(pixels.any() for pixels in ignored):
+        masks = MaskDistances(
+            fit.views, [np.maximum(*each) for each in zip(fit.alphas, ignored, strict=True)]
+        )
+    return [template_of(fit.scene.subject, hull).closed for hull in hulls_of(fit, masks, disbelieved)]
 
 
 def _larger(hull: Mesh, larger: Mesh, cell: float) -> np.ndarray:

@@ -109,7 +109,7 @@ class Refinement:
         """The template after the steps; None if they get nowhere."""
         outlines = None
         if fit.training.has_alpha:
-            outlines = Outlines(fit.views, fit.scene.targets, template.faces, template.solid)
+            outlines = Outlines(fit.masks, fit.scene.targets, template.faces, template.solid)
         refinement = PhotometricRefinement(
             appearance, positions, template.faces, outlines, cell, self.config, fit.config.seed
         )

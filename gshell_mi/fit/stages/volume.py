@@ -39,7 +39,7 @@ class Volume:
         volume = self._volume(fit, before, steps.kept)
         steps.run(volume, self.config.iterations, volume.optimizers, volume.arrays)
         with steps.task("depth", len(fit.views)) as advance:
-            other = volume_surface(volume, fit.scene, lattice, surface.seen.light, advance)
+            other = volume_surface(volume, fit.scene, fit.masks, lattice, surface.seen.light, advance)
         if other is None:
             return surface
         with steps.task("verdict"):
@@ -57,7 +57,7 @@ class Volume:
         centre = (np.arange(side, dtype=np.float32) + 0.5) * (2 / side) - 1
         z, y, x = (axis.ravel() for axis in np.meshgrid(centre, centre, centre, indexing="ij"))
         points = mi.Transform4f(subject.to_world) @ mi.Point3f(x, y, z)
-        hull = visual_hull(points, fit.views, fit.alphas)
+        hull = visual_hull(points, fit.masks)
         hull = np.clip(hull.numpy() / subject.length_scale, -1, 1).reshape((side,) * 3)
         return RadianceVolume(
             hull,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from bowl import RADIUS
 
+from gshell_mi.fields.mask_distances import MaskDistances
 from gshell_mi.fields.visual_hull import visual_hull
 from gshell_mi.fit.bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
 from gshell_mi.fit.radiance.config import VolumeConfig
@@ -34,7 +35,7 @@ def _volume(scene: FitScene, config: VolumeConfig = CONFIG, stored=None) -> Radi
     centre = (np.arange(side, dtype=np.float32) + 0.5) * (2 / side) - 1
     z, y, x = (axis.ravel() for axis in np.meshgrid(centre, centre, centre, indexing="ij"))
     alphas = [target.rgba[..., 3] for target in scene.targets]
-    hull = visual_hull(mi.Point3f(x, y, z), views, alphas).numpy().reshape((side,) * 3)
+    hull = visual_hull(mi.Point3f(x, y, z), MaskDistances(views, alphas)).numpy().reshape((side,) * 3)
     surface = np.zeros((1, 3), np.float32), np.zeros((0, 3), np.uint32)
     return RadianceVolume(
         np.clip(hull, -1, 1),
@@ -93,7 +94,8 @@ def test_opacity_is_that_of_a_length(scene):
 def test_its_surface_is_around_the_bowl(scene, trained):
     """Wide enough for the lattice, and no wider; what it shows is what is seen there."""
     lattice = make_lattice("cube", 32)
-    found = volume_surface(trained, scene, lattice, np.float32(1))
+    masks = MaskDistances(trained.views, [target.most_alpha for target in scene.targets])
+    found = volume_surface(trained, scene, masks, lattice, np.float32(1))
     vertices, faces, _ = scene.subject.surface_of(found.fields).to_numpy()
     assert topology(vertices, faces).components == 1 and topology(vertices, faces).boundary_loops == 0
     below = vertices[vertices[:, 1] < -0.1]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from gshell_mi.fields.mask_distances import MaskDistances
 from gshell_mi.fit.judge import Judge
 from gshell_mi.fit.radiance.layers import Layer
 from gshell_mi.fit.radiance.surface_radiance import RadianceConfig, SurfaceRadiance
@@ -64,12 +65,16 @@ def capture() -> tuple[PinholeViews, PixelPool, list[Target]]:
     return views, PixelPool(views, targets), targets
 
 
+def masks_of(views, targets) -> MaskDistances:
+    return MaskDistances(views, [target.most_alpha for target in targets])
+
+
 def refinement(capture, vertices, faces, with_outlines) -> PhotometricRefinement:
     views, pixels, targets = capture
     solid = np.ones(len(vertices), bool)
     appearance = SurfaceRadiance(vertices, faces, views, pixels, RADIANCE)
     appearance.refit(solid)
-    outlines = Outlines(views, targets, faces, solid) if with_outlines else None
+    outlines = Outlines(masks_of(views, targets), targets, faces, solid) if with_outlines else None
     return PhotometricRefinement(appearance, vertices, faces, outlines, CELL, CONFIG)
 
 
@@ -104,7 +109,7 @@ def test_outline_of_the_true_sphere_is_the_masks(capture):
     def distance(scale: float) -> float:
         vertices = scale * np.array(mesh.vertices)
         appearance = SurfaceRadiance(vertices, faces, views, capture[1], RADIANCE)
-        outlines = Outlines(views, targets, faces, np.ones(len(vertices), bool))
+        outlines = Outlines(masks_of(views, targets), targets, faces, np.ones(len(vertices), bool))
         loss = outlines.loss(mi.Float(vertices.ravel()), appearance.scene, np.arange(len(views)))
         return float(np.sqrt(loss[0])) / pixel
 
@@ -128,7 +133,7 @@ def test_outlines_of_what_is_unknown_are_none(capture):
     losses = [
         float(
             np.sqrt(
-                Outlines(views, each, faces, np.ones(len(vertices), bool)).loss(
+                Outlines(masks_of(views, each), each, faces, np.ones(len(vertices), bool)).loss(
                     mi.Float(vertices.ravel()), appearance.scene, np.arange(len(views))
                 )[0]
             )
@@ -143,7 +148,7 @@ def test_outline_loss_derivative_is_that_of_a_scaled_sphere(capture):
     views, pixels, targets = capture
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=1.05 * RADIUS)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-    outlines = Outlines(views, targets, faces, np.ones(len(vertices), bool))
+    outlines = Outlines(masks_of(views, targets), targets, faces, np.ones(len(vertices), bool))
     appearance = SurfaceRadiance(vertices, faces, views, pixels, RADIANCE)
     every = np.arange(len(views))
 
