@@ -87,8 +87,8 @@ class AssetConfig:
 def write_asset(folder: Path, config: AssetConfig | None = None) -> dict:
     """Writes ``mesh.glb``, and what else is asked for, from ``mesh.ply`` and the sensors of ``scene.xml``.
 
-    Units are those of the scene (glTF takes them for metres). The up axis of glTF is y; the object is turned
-    so that the axis which is up in the views (``up_axis``) becomes y.
+    Units are those of the scene (glTF takes them for metres), and the object's name is the folder's. The up
+    axis of glTF is y; the object is turned so that the axis which is up in the views (``up_axis``) becomes y.
 
     Returns:
         Counts: ``faces``, ``charts`` (0: colours are at the vertices), and of ``remeshed.ply``
@@ -128,14 +128,15 @@ def _write(folder: Path, fine: FittedMesh, turn: np.ndarray, config: AssetConfig
     atlas = unwrap(vertices, faces, texture_size=config.texture_size, seconds=config.unwrap_seconds)
     normals = vertex_normals(vertices, faces)
     report = {"faces": len(faces), "charts": atlas.charts if atlas else 0} | remeshed
+    name = folder.resolve().name
     if atlas:
         vertices, normals, faces = vertices[atlas.source], normals[atlas.source], atlas.faces
         tangents = vertex_tangents(vertices, normals, faces, atlas.uv)
         textures = bake(fine, vertices, normals, tangents, faces, atlas.uv, config.texture_size)
-        part = textured_part(vertices, normals, tangents, faces, atlas.uv, textures)
+        part = textured_part(vertices, normals, tangents, faces, atlas.uv, textures, name)
         write_glb(folder / "mesh.glb", [part])
         if config.obj:
-            _write_obj(folder, vertices, normals, faces, atlas.uv, textures)
+            _write_obj(folder, vertices, normals, faces, atlas.uv, textures, name)
     else:
         source = project(fine, vertices, normals)
         color, roughness, metallic = (
@@ -146,7 +147,7 @@ def _write(folder: Path, fine: FittedMesh, turn: np.ndarray, config: AssetConfig
             folder / "mesh.glb",
             [
                 Part(
-                    "subject",
+                    name,
                     faces,
                     {"POSITION": vertices, "NORMAL": normals, "COLOR_0": np.clip(color, 0, 1)},
                     {
@@ -172,6 +173,7 @@ def textured_part(
     faces: np.ndarray,
     uv: np.ndarray,
     textures: Textures,
+    name: str,
 ) -> Part:
     """The object as glTF wants it, both sides visible."""
     attributes = {
@@ -192,7 +194,7 @@ def textured_part(
     images = {
         name: getattr(textures, name) for name in ("base_color", "occlusion_roughness_metallic", "normal")
     }
-    return Part("subject", faces, attributes, material, images)
+    return Part(name, faces, attributes, material, images)
 
 
 def _simplified(fine: FittedMesh, face_count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -221,6 +223,7 @@ def _write_obj(
     faces: np.ndarray,
     uv: np.ndarray,
     textures: Textures,
+    name: str,
 ) -> None:
     """``mesh.obj`` and ``mesh.mtl`` with the PBR extension of MTL (map_Pr, map_Pm, norm), v upwards."""
     orm = textures.occlusion_roughness_metallic
@@ -230,19 +233,19 @@ def _write_obj(
         "metallic": orm[..., 2],
         "normal": textures.normal,
     }
-    for name, image in images.items():
-        with replacing(folder / f"mesh_{name}.png") as partial:
+    for kind, image in images.items():
+        with replacing(folder / f"mesh_{kind}.png") as partial:
             Image.fromarray(image).save(partial)
     with replacing(folder / "mesh.mtl") as partial:
         partial.write_text(
-            "newmtl subject\nKd 1 1 1\nillum 2\nmap_Kd mesh_base_color.png\nmap_Pr mesh_roughness.png\n"
+            f"newmtl {name}\nKd 1 1 1\nillum 2\nmap_Kd mesh_base_color.png\nmap_Pr mesh_roughness.png\n"
             "map_Pm mesh_metallic.png\nnorm mesh_normal.png\n",
             encoding="utf-8",
         )
     # Welded: one position per point, or simulators would tear the object along the atlas's seams.
     welded, index = np.unique(vertices, axis=0, return_inverse=True)
     index = index.ravel()
-    lines = ["mtllib mesh.mtl", "o subject", "usemtl subject"]
+    lines = ["mtllib mesh.mtl", f"o {name}", f"usemtl {name}"]
     lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in welded.tolist()]
     lines += [f"vt {u:.6g} {v:.6g}" for u, v in uv.tolist()]
     lines += [f"vn {x:.5g} {y:.5g} {z:.5g}" for x, y, z in normals.tolist()]

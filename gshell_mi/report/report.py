@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import warnings
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -14,7 +15,7 @@ from markupsafe import Markup
 
 from ..environment_maps import read_environment_map
 from ..errors import UserError
-from ..export.asset import write_asset
+from ..export.asset import NO_ATLAS, write_asset
 from ..files import replacing
 from ..images import BOTH, FIT_ONLY, MASK_ONLY, UNKNOWN, srgb
 from ..own_folder import TAG, own_folder
@@ -90,8 +91,8 @@ def _write(folder: Path, metrics: dict, config: ReportConfig) -> Path:
         orange_back=True,
     )
     frames = render_turntable(folder, turntable)
-    if not (folder / "mesh.glb").is_file():
-        write_asset(folder)
+    if not (folder / "mesh.glb").is_file() and not write_asset(folder)["charts"]:
+        warnings.warn(NO_ATLAS, stacklevel=2)
     with tempfile.TemporaryDirectory() as place:
         (video,) = write_video(frames, Path(place) / "turntable.mp4", turntable.fps, gif=False)
         video_data = data_url("video/mp4", video.read_bytes())

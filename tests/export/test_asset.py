@@ -120,6 +120,13 @@ def test_boundary_loops_are_those_of_the_mesh(asset):
     assert after.faces == asset[1]["faces"] < before.faces
 
 
+def test_the_object_is_called_as_the_folder_is(asset):
+    folder, _ = asset
+    assert list(trimesh.load(folder / "mesh.glb").graph.nodes_geometry) == [folder.name]
+    assert f"o {folder.name}\nusemtl {folder.name}\n" in (folder / "mesh.obj").read_text()
+    assert f"newmtl {folder.name}\n" in (folder / "mesh.mtl").read_text()
+
+
 def test_base_colour(asset):
     mesh = trimesh.load(asset[0] / "mesh.glb", force="mesh")
     points, _, _, blend = on_surface(mesh)

@@ -294,7 +294,7 @@ def test_a_folder_that_a_fit_is_writing(folder, tmp_path, capsys):
 def test_model_of_the_view(folder):
     data = viewer_model(folder)
     document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    names = ["subject", "back faces", "template", "boundary loops"]
+    names = [folder.name, "back faces", "template", "boundary loops"]
     assert [material["name"] for material in document["materials"]] == names
     subject = read_part(data)
     mesh = open_sphere(3)
