@@ -75,16 +75,15 @@ class Mirrored:
             color: of the surface.
             view: index of the view that a ray is of.
         """
-        explained, basis, of_ray = (color * self.factor(direction)).numpy(), _basis(direction), view.numpy()
-        order = np.argsort(of_ray, kind="stable")
-        ends = np.flatnonzero(np.diff(of_ray[order])) + 1
+        order = np.argsort(view.numpy(), kind="stable")
+        ends = np.flatnonzero(np.diff(view.numpy()[order])) + 1
+        basis = np.stack([value.numpy()[order] for value in _harmonics(direction)])
+        channels = (values.numpy()[:, order] for values in (radiance, color, color * self.factor(direction)))
         found = np.zeros_like(self.coefficients)
-        for channel, (seen, own, now) in enumerate(
-            zip(radiance.numpy(), color.numpy(), explained, strict=True)
-        ):
+        for channel, (seen, own, now) in enumerate(zip(*channels, strict=True)):
             scale = 1 / np.maximum(own, max(DARK * own.mean(), 1e-9))
-            slope = (basis * (own * scale))[:, order]
-            change = np.clip((seen - now) * scale, -_OUTLIER, _OUTLIER)[order]
+            slope = basis * (own * scale)
+            change = np.clip((seen - now) * scale, -_OUTLIER, _OUTLIER)
             values = change + self.coefficients[channel] @ slope
             by_view = list(zip(np.split(slope, ends, axis=1), np.split(values, ends), strict=True))
             left = np.array([part @ part.T for part, _ in by_view], np.float64)
@@ -117,11 +116,6 @@ def mirrored_direction(direction: mi.Vector3f, normal: mi.Vector3f) -> mi.Vector
     """Where a ray along a unit ``direction`` is mirrored to, at normals of any length and sign."""
     normal = normal / dr.maximum(dr.norm(normal), 1e-12)
     return direction - 2 * dr.dot(direction, normal) * normal
-
-
-def _basis(direction: mi.Vector3f) -> np.ndarray:
-    """(48, n) harmonics of directions."""
-    return np.stack([value.numpy() for value in _harmonics(direction)])
 
 
 def _harmonics(direction: mi.Vector3f) -> list[mi.Float]:
