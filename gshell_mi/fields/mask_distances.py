@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..views import PinholeViews
-from .mask_outline import mask_distance, sharp
+from .mask_outline import mask_distance, sharp, with_thin_parts
 
 
 class MaskDistances:
@@ -28,24 +28,13 @@ class MaskDistances:
     """
 
     def __init__(self, views: PinholeViews, alphas: list[np.ndarray]):
-        self.views, thin_parts = views, sharp(alphas)
-
-        def distances(alpha: np.ndarray, size: np.ndarray) -> list[np.ndarray]:
-            # Finite next to an empty mask, or interpolation would give NaN.
-            diagonal, holes = float(np.hypot(*size)), _has_holes(alpha)
-            return [
-                mask_distance(alpha, fill_holes=filled, thin_parts=thin_parts)
-                .clip(-diagonal, diagonal)
-                .astype(np.float32)
-                .ravel()
-                for filled in ((False, True) if holes else (False,))
-            ]
-
+        self.views = views
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            found = list(pool.map(distances, alphas, views.sizes))
-        self.plain = mi.Float(np.concatenate([each[0] for each in found]))
-        holes = any(len(each) > 1 for each in found)
-        self.filled = mi.Float(np.concatenate([each[-1] for each in found])) if holes else self.plain
+            thin = list(pool.map(with_thin_parts, alphas)) if sharp(alphas) else alphas
+            found = list(pool.map(_distances, thin))
+        self.plain = mi.Float(np.concatenate([plain for plain, _ in found]))
+        holes = any(filled is not plain for plain, filled in found)
+        self.filled = mi.Float(np.concatenate([filled for _, filled in found])) if holes else self.plain
         self._first = mi.UInt32(np.concatenate([[0], np.cumsum(views.sizes.prod(axis=1))[:-1]]))
         self._size = mi.UInt32(views.sizes.ravel())
         self._whole = mi.Bool([not _touches_border(alpha) for alpha in alphas])
@@ -79,9 +68,14 @@ class MaskDistances:
         return dr.select(whole, dr.select(depth > 0, distance, behind), dr.select(framed, distance, -dr.inf))
 
 
-def _has_holes(alpha: np.ndarray) -> bool:
-    inside = alpha >= 0.5
-    return bool((ndimage.binary_fill_holes(inside) & ~inside).any())
+def _distances(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of one mask, (P,), as it is and with its holes filled; the same array if it has none."""
+    # Finite next to an empty mask, or interpolation would give NaN.
+    diagonal, inside = float(np.hypot(*alpha.shape)), alpha >= 0.5
+    plain = mask_distance(alpha, fill_holes=False).clip(-diagonal, diagonal).astype(np.float32).ravel()
+    if (ndimage.binary_fill_holes(inside) == inside).all():
+        return plain, plain
+    return plain, mask_distance(alpha).clip(-diagonal, diagonal).astype(np.float32).ravel()
 
 
 def _touches_border(alpha: np.ndarray) -> bool:

@@ -19,7 +19,7 @@ _HAZE = 0.7
 _STEEP = 0.45
 
 
-def mask_distance(alpha: np.ndarray, *, fill_holes: bool = True, thin_parts: bool = False) -> np.ndarray:
+def mask_distance(alpha: np.ndarray, *, fill_holes: bool = True) -> np.ndarray:
     """Signed distance to the outline of a coverage mask, negative inside.
 
     The outline is the level set 1/2 of the coverage, located by linear interpolation between pixel
@@ -30,14 +30,10 @@ def mask_distance(alpha: np.ndarray, *, fill_holes: bool = True, thin_parts: boo
         fill_holes: drops outlines that are enclosed by the object. Daylight seen through a garment
             (in at the neck, out at a sleeve) would carve a tunnel through the hull whose walls then
             have to be undone.
-        thin_parts: takes what covers less than half of every pixel around, such as a sheet seen edge-on,
-            for a pixel wide. That widens the outlines of masks that are not ``sharp``.
 
     Returns:
         (height, width) distances at the pixel centres, in pixels. An empty mask is +inf everywhere.
     """
-    if thin_parts:
-        alpha = _with_thin_parts(alpha)
     inside = alpha >= 0.5
     if fill_holes:
         filled = ndimage.binary_fill_holes(inside)
@@ -72,8 +68,12 @@ def sharp(alphas: list[np.ndarray]) -> bool:
     return len(rises) == 0 or bool(np.percentile(rises, 90) > _STEEP)
 
 
-def _with_thin_parts(alpha: np.ndarray) -> np.ndarray:
-    """The coverage, scaled up where none nearby is nearly full, to where the greatest is."""
+def with_thin_parts(alpha: np.ndarray) -> np.ndarray:
+    """A coverage mask in which what covers less than half of every pixel around, such as a sheet seen
+    edge-on, is a pixel wide. That widens the outlines of masks that are not ``sharp``.
+
+    It is scaled up where none nearby is nearly full, to where the greatest is.
+    """
     greatest = ndimage.maximum_filter(alpha, 3)
     thin = (alpha > _FAINT) & (greatest < _FULL)
     thin &= ndimage.uniform_filter(thin.astype(np.float32), 5) < _HAZE

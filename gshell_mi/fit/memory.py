@@ -16,7 +16,7 @@ from .config import FitConfig
 # 128 cells, 12 to 100 views and 128 to 800 pixels per side. pipelines/calibrate_memory.py repeats it.
 _PROGRAM = 280 * 2**20  # Python, Mitsuba, LLVM and its kernels
 _ASSET = 350 * 2**20  # baking the textures of mesh.glb
-_PER_PIXEL = 80  # of all targets: NumPy's copy, pools of stages and judge, outlines
+_PER_PIXEL = 88  # of all targets: NumPy's copy, pools of stages and judge, outlines
 _PER_CORRECTED = 16  # of all targets once more, if their exposures differ
 _PER_VERTEX = 490  # of the lattice: fields and material, their Adam moments and gradients
 _PER_HULL_SAMPLE = 75  # of the visual hull, which is finer than the lattice, and ...

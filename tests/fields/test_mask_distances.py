@@ -38,13 +38,13 @@ def test_at_the_centres_of_pixels_they_are_those_of_the_mask(views, alphas):
             row, column = np.mgrid[:height, :width].reshape(2, -1)
             film = mi.Point2f((column + 0.5) / width, (row + 0.5) / height)
             found = masks.at(values, dr.full(mi.UInt32, view, width * height), film)
-            expected = mask_distance(alpha, fill_holes=filled, thin_parts=True)
+            expected = mask_distance(alpha, fill_holes=filled)
             np.testing.assert_allclose(found.numpy(), expected.ravel(), atol=1e-4)
 
 
 def test_between_and_beyond_the_centres(views, alphas):
     masks, alphas = MaskDistances(views, alphas), alphas
-    first = mask_distance(alphas[0], fill_holes=False, thin_parts=True)
+    first = mask_distance(alphas[0], fill_holes=False)
     film = mi.Point2f([3.0 / 12, -0.5, 2.0], [2.0 / 7, -0.5, 2.0])
     found = masks.at(masks.plain, mi.UInt32(0, 0, 0), film).numpy()
     np.testing.assert_allclose(found, [first[1:3, 2:4].mean(), first[0, 0], first[-1, -1]], atol=1e-4)
@@ -54,3 +54,16 @@ def test_masks_without_holes_are_filled(views, alphas):
     alphas[0][3, 4:6] = 1
     masks = MaskDistances(views, alphas)
     assert masks.filled is masks.plain
+
+
+def test_a_ring_thinner_than_a_pixel_has_a_hole(views, alphas):
+    """Nowhere is it half of a pixel, but what it encloses is daylight."""
+    alphas[0][:] = 0
+    alphas[0][1:6, 2:9] = 0.48
+    alphas[0][2:5, 3:8] = 0
+    alphas[1][:], alphas[2][:] = 0, 0
+    masks = MaskDistances(views, alphas)
+    plain, filled = (
+        values.numpy()[: alphas[0].size].reshape(7, 12) for values in (masks.plain, masks.filled)
+    )
+    assert plain[1, 4] < 0 < plain[3, 5] and filled[3, 5] < 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from gshell_mi.fields.mask_outline import mask_distance, sharp
+from gshell_mi.fields.mask_outline import mask_distance, sharp, with_thin_parts
 
 
 def test_distance_to_a_disc_is_sub_pixel():
@@ -36,7 +36,7 @@ def test_a_sheet_seen_edge_on_counts_as_a_pixel_wide(shares):
     alpha = np.zeros((32, 32))
     alpha[4:28, 16 : 16 + len(shares)] = shares
     assert (mask_distance(alpha) > 0).all()
-    distance = mask_distance(alpha, thin_parts=True)
+    distance = mask_distance(with_thin_parts(alpha))
     peak = 16 + int(np.argmax(shares))
     assert (distance[5:27, peak] < 0).all()
     assert distance[16, peak + 8] == pytest.approx(7.5, abs=0.75)
@@ -44,7 +44,7 @@ def test_a_sheet_seen_edge_on_counts_as_a_pixel_wide(shares):
 
 @pytest.mark.parametrize("haze", [0.005, 0.04, 0.3])
 def test_faint_haze_is_no_sheet(haze):
-    assert (mask_distance(np.full((16, 16), haze), thin_parts=True) == np.inf).all()
+    assert (mask_distance(with_thin_parts(np.full((16, 16), haze))) == np.inf).all()
 
 
 def blurred_disc(blur: float) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +60,7 @@ def blurred_disc(blur: float) -> tuple[np.ndarray, np.ndarray]:
 def test_a_sharp_edge_stays_where_it_is(blur):
     alpha, exact = blurred_disc(blur)
     assert sharp([alpha])
-    assert np.abs(mask_distance(alpha, thin_parts=True) - exact)[np.abs(exact) < 5].max() < 0.15
+    assert np.abs(mask_distance(with_thin_parts(alpha)) - exact)[np.abs(exact) < 5].max() < 0.15
 
 
 @pytest.mark.parametrize("blur", [1.0, 1.5, 3.0])
