@@ -34,13 +34,6 @@ _VOTES = 0.3
 #: Coverage from which on a pixel shows the object.
 _COVERED = 0.5
 
-#: Standard deviation, in cells, that smooths the distances: depths of single rays waver by about a cell, and
-#: what the joint stage moves, it moves smoothly.
-_SMOOTHING = 1.0
-
-#: Cells from which on a part, or a gap, is thick enough to be smoothed, partly and wholly.
-_THICK = 1.5, 2.5
-
 #: What floats and has fewer lattice vertices than a ball of this radius, in cells, is noise.
 _FLOATER = 2.0
 
@@ -86,7 +79,6 @@ def volume_surface(
     )
     distance[near] = np.maximum(distance[near], inside.numpy())
     outside = without_specks((distance / cell).reshape((lattice.stride,) * 3), margin) - margin
-    outside = smoothed(outside)
     sdf = closed_at_border(lattice.spacing * outside.ravel(), lattice)
     if not (sdf < 0).any():
         return None
@@ -95,22 +87,6 @@ def volume_surface(
     inside = vertices - margin * cell * normals_at_vertices(vertices, faces)
     seen = Seen.on(lattice, mesh, volume.radiance_at(inside), light)
     return Surface(LatticeFields.closed(sdf, lattice.grid), seen=seen)
-
-
-def smoothed(distance: np.ndarray) -> np.ndarray:
-    """Distances in cells, negative inside, without bumps. Parts and gaps of about a cell stay as they are:
-    they would be gone."""
-    inside = distance < 0
-    depth = ndimage.distance_transform_edt(inside) + ndimage.distance_transform_edt(~inside)
-    reach = np.mgrid[-3:4, -3:4, -3:4]
-    ball = (reach**2).sum(axis=0) <= _TRUNCATION**2
-    thickest = (
-        ndimage.maximum_filter(np.where(side, depth, 0), footprint=ball) for side in (inside, ~inside)
-    )
-    share = np.clip((np.minimum(*thickest) - _THICK[0]) / (_THICK[1] - _THICK[0]), 0, 1)
-    told = np.clip(distance, -_TRUNCATION, _TRUNCATION)
-    moved = share * (ndimage.gaussian_filter(told, _SMOOTHING) - told)
-    return np.where(np.abs(distance) < _TRUNCATION, distance + moved, distance)
 
 
 def without_specks(distance: np.ndarray, level: float) -> np.ndarray:
