@@ -57,13 +57,6 @@ def eikonal(step: StepView) -> mi.Float:
     return losses.eikonal(step.in_cells("sdf"), step.subject.lattice)
 
 
-@register_loss("template_smoothness")
-def template_smoothness(step: StepView) -> mi.Float:
-    """Squared difference of the template's normals along its edges."""
-    normals = mi.Vector3f(step.template.vertex_normals())
-    return losses.normal_variation(normals, mi.Vector3u(step.template.faces))
-
-
 @register_loss("albedo_chroma", per_view=True, needs="material")
 def albedo_chroma(step: StepView) -> mi.Float:
     """Difference between the chroma of the base colour and of the image that shows it."""

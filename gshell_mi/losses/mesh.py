@@ -8,6 +8,9 @@ import mitsuba as mi
 from ..extraction.surface_mesh import gather
 from ..means import mean
 
+#: Differences of unit normals much smaller than this are flat: half a degree.
+_FLAT = 0.01
+
 
 def edge_smoothness(values: mi.Color3f | mi.Float, faces: mi.Vector3u) -> mi.Float:
     """Mean absolute difference of vertex values along the faces' edges."""
@@ -16,7 +19,8 @@ def edge_smoothness(values: mi.Color3f | mi.Float, faces: mi.Vector3u) -> mi.Flo
 
 
 def normal_variation(normals: mi.Vector3f, faces: mi.Vector3u) -> mi.Float:
-    """Mean squared difference of unit vertex normals along the faces' edges: a bending energy.
+    """Mean difference of unit vertex normals along the faces' edges: their total variation (Zhang and others,
+    2015), which flattens bumps, and leaves creases and bends as they are.
 
     Unlike a Laplacian of the positions it does not shrink the surface along itself, and vertices that
     marching tetrahedra left close together do not count for more.
@@ -26,4 +30,7 @@ def normal_variation(normals: mi.Vector3f, faces: mi.Vector3u) -> mi.Float:
         faces: vertex indices.
     """
     corners = [gather(type(normals), normals, faces[i]) for i in range(3)]
-    return sum(mean(dr.squared_norm(corners[i] - corners[i - 1])) for i in range(3)) / 3
+    if not dr.width(faces):
+        return mi.Float(0)
+    lengths = (dr.sqrt(dr.squared_norm(corners[i] - corners[i - 1]) + _FLAT**2) - _FLAT for i in range(3))
+    return sum(mean(length) for length in lengths) / 3

@@ -11,6 +11,7 @@ from bowl import RADIUS
 from gshell_mi import extras, losses  # noqa: F401 the former registers losses
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit import FitConfig
+from gshell_mi.fit.joint.config import LossConfig
 from gshell_mi.fit.joint.joint import JointStage
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField
@@ -21,6 +22,7 @@ NONE = FitConfig(iterations=4).changed(
     {
         "losses.material_smoothness": 0.0,
         "losses.light_grey": 0.0,
+        "losses.normal_variation": 0.0,
         "losses.flexicubes_deviation": 0.0,
         "render.spp": 1,
         "render.primal_spp": 1,
@@ -44,7 +46,8 @@ def stage(fit, *, top: float = 0.0, radius: float = RADIUS, noise: float = 0.0, 
     fields = LatticeFields.closed(sdf)
     fit.subject.set_fields(replace(fields, msdf=(top - points[:, 1]).astype(np.float32)))
     material = MaterialField(np.full((lattice.vertex_count, 3), 0.5))
-    config = NONE.changed({"losses.extra": weights})
+    own = {f"losses.{name}": weights.pop(name) for name in vars(LossConfig()).keys() & weights.keys()}
+    config = NONE.changed({"losses.extra": weights} | own)
     return JointStage(fit, material, EnvironmentLight.uniform(4, 1.0), config)
 
 
@@ -130,16 +133,16 @@ def test_what_is_seen_outside_the_mask_goes(fit):
     assert found["msdf"][y < -0.2].sum() < 0.05 * found["msdf"][y > 0.1].sum()
 
 
-def test_template_smoothness_smooths(fit):
-    joint = stage(fit, noise=0.02, template_smoothness=1.0)
+def test_normal_variation_smooths(fit):
+    joint = stage(fit, noise=0.02, normal_variation=1.0)
     rough, found = gradients(joint)
-    smooth, _ = gradients(stage(fit, template_smoothness=1.0))
-    assert rough["template_smoothness"] > 2 * smooth["template_smoothness"]
+    smooth, _ = gradients(stage(fit, normal_variation=1.0))
+    assert rough["normal_variation"] > 1.5 * smooth["normal_variation"]
     step = 0.02 * found["sdf"] / np.abs(found["sdf"]).max()
     geometry = joint.geometry.optimizer
     geometry["sdf"] = geometry["sdf"] - mi.Float(step.astype(np.float32))
     after, _ = gradients(joint)
-    assert after["template_smoothness"] < rough["template_smoothness"]
+    assert after["normal_variation"] < rough["normal_variation"]
 
 
 def test_eikonal_of_the_start(fit):
