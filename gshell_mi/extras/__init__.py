@@ -4,7 +4,7 @@ Importing this registers them by name, as a user's own would be: ``--losses.extr
 ``--model.field NAME``.
 
 - losses: ``hole_opening``, ``hole_closing``, ``visible_outside``, ``visible_inside``, ``sdf_sign``,
-  ``eikonal``, ``albedo_chroma``, ``light_smoothness`` (docs/losses.md)
+  ``eikonal``, ``normal_variation``, ``albedo_chroma``, ``light_smoothness`` (docs/losses.md)
 - parametrisations: ``flexicubes``, ``multiresolution``, ``hashgrid``, ``sinusoidal`` (docs/grids.md)
 """
 

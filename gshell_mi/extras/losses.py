@@ -57,6 +57,13 @@ def eikonal(step: StepView) -> mi.Float:
     return losses.eikonal(step.in_cells("sdf"), step.subject.lattice)
 
 
+@register_loss("normal_variation")
+def normal_variation(step: StepView) -> mi.Float:
+    """Differences of the surface's normals along edges: bumps that no image asks for go."""
+    surface = step.subject.surface
+    return losses.normal_variation(mi.Vector3f(surface.vertex_normals()), mi.Vector3u(surface.faces))
+
+
 @register_loss("albedo_chroma", per_view=True, needs="material")
 def albedo_chroma(step: StepView) -> mi.Float:
     """Difference between the chroma of the base colour and of the image that shows it."""

@@ -147,7 +147,6 @@ CHOICES = [
         ("no-material-smoothness", "material smoothness", {"losses.material_smoothness": 0.0}),
         ("no-material-sobolev", "Sobolev gradient of the material", {"joint.material_smoothing": 0.0}),
         ("no-grey-world", "grey-world prior", {"losses.light_grey": 0.0}),
-        ("no-normal-variation", "variation of normals", {"losses.normal_variation": 0.0}),
     ),
     *_group(
         "Opening and closing weights",
@@ -171,6 +170,7 @@ CHOICES = [
         "Losses put in",
         ("sdf-sign", "sign cross-entropy 0.002", {"losses.extra": {"sdf_sign": 0.002}}),
         ("eikonal", "eikonal 0.002", {"losses.extra": {"eikonal": 0.002}}),
+        ("normal-variation", "variation of normals 0.1", {"losses.extra": {"normal_variation": 0.1}}),
         ("albedo-chroma", "albedo chroma 0.1", {"losses.extra": {"albedo_chroma": 0.1}}),
         ("light-smoothness", "light smoothness 0.02", {"losses.extra": {"light_smoothness": 0.02}}),
     ),

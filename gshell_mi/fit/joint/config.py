@@ -53,8 +53,6 @@ class LossConfig:
     """Weight of the mask loss."""
     depth: float = 0.01
     """Weight of the depth loss, in cells; only used with depth maps."""
-    normal_variation: float = 0.1
-    """Weight of the differences between normals along edges: bumps that no image asks for go."""
     material_smoothness: float = 0.01
     """Weight of the difference between the material at a point and at a point nearby."""
     light_grey: float = 0.005

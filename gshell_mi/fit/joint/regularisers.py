@@ -208,13 +208,6 @@ def _flexicubes_deviation(step: StepView) -> mi.Float:
     return mean(spread) / step.subject.lattice.spacing
 
 
-@register_loss("normal_variation")
-def _normal_variation(step: StepView) -> mi.Float:
-    """Differences of the surface's normals along edges."""
-    surface = step.subject.surface
-    return losses.normal_variation(mi.Vector3f(surface.vertex_normals()), mi.Vector3u(surface.faces))
-
-
 @register_loss("material_smoothness", needs="material")
 def _material_smoothness(step: StepView) -> mi.Float:
     """Differences of the material along edges."""

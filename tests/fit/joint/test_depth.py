@@ -118,9 +118,7 @@ def stage(fit, radius: float, settings: dict | None = None) -> JointStage:
     points = lattice.vertex_positions()
     fit.subject.set_fields(LatticeFields.closed(np.linalg.norm(points, axis=1) - radius))
     material = MaterialField(np.full((lattice.vertex_count, 3), 0.5))
-    none = dict.fromkeys(
-        ("losses.mask", "losses.normal_variation", "losses.material_smoothness", "losses.light_grey"), 0.0
-    )
+    none = dict.fromkeys(("losses.mask", "losses.material_smoothness", "losses.light_grey"), 0.0)
     return JointStage(fit, material, None, FitConfig().changed(none | (settings or {})))
 
 

@@ -16,7 +16,13 @@ from gshell_mi.lattice import make_lattice
 from gshell_mi.scene import load_fit_scene
 
 #: Losses over the surface, whose size changes, that the defaults leave out.
-LOSSES = {"hole_opening": 1e-3, "hole_closing": 1e-3, "sdf_sign": 1e-3, "eikonal": 1e-3}
+LOSSES = {
+    "hole_opening": 1e-3,
+    "hole_closing": 1e-3,
+    "sdf_sign": 1e-3,
+    "eikonal": 1e-3,
+    "normal_variation": 1e-3,
+}
 CONFIG = FitConfig(iterations=100).changed(
     {
         "lattice.band_resolution": 99,

@@ -11,7 +11,6 @@ from bowl import RADIUS
 from gshell_mi import extras, losses  # noqa: F401 the former registers losses
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit import FitConfig
-from gshell_mi.fit.joint.config import LossConfig
 from gshell_mi.fit.joint.joint import JointStage
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import MaterialField
@@ -22,7 +21,6 @@ NONE = FitConfig(iterations=4).changed(
     {
         "losses.material_smoothness": 0.0,
         "losses.light_grey": 0.0,
-        "losses.normal_variation": 0.0,
         "losses.flexicubes_deviation": 0.0,
         "render.spp": 1,
         "render.primal_spp": 1,
@@ -46,8 +44,7 @@ def stage(fit, *, top: float = 0.0, radius: float = RADIUS, noise: float = 0.0, 
     fields = LatticeFields.closed(sdf)
     fit.subject.set_fields(replace(fields, msdf=(top - points[:, 1]).astype(np.float32)))
     material = MaterialField(np.full((lattice.vertex_count, 3), 0.5))
-    own = {f"losses.{name}": weights.pop(name) for name in vars(LossConfig()).keys() & weights.keys()}
-    config = NONE.changed({"losses.extra": weights} | own)
+    config = NONE.changed({"losses.extra": weights})
     return JointStage(fit, material, EnvironmentLight.uniform(4, 1.0), config)
 
 
