@@ -35,9 +35,9 @@ class Progress:
         self._quiet, self.warnings = quiet, list[str]()
         self._bars = Bars(
             SpinnerColumn(),
-            TextColumn("{task.description}:", table_column=Column(min_width=19)),
+            TextColumn("{task.description}:", table_column=Column(min_width=19, no_wrap=True)),
             BarColumn(bar_width=24),
-            _Detail(),
+            _Detail(Column(no_wrap=True)),
             quiet=quiet,
         )
         self._console, self._reference = self._bars.console, None

@@ -1,8 +1,10 @@
+import io
 import re
 import time
 from functools import partial
 
 import pytest
+from rich.console import Console
 
 from gshell_mi import progress as module
 from gshell_mi.progress import Progress, usual_duration
@@ -30,6 +32,16 @@ def test_time_left_after_a_first_step_that_compiles(monkeypatch: pytest.MonkeyPa
             advance()
         assert re.fullmatch(r"10/100  0\.50 s/step  0:45 left", detail())
     assert detail() == "64.5 s"
+
+
+def test_a_stage_is_one_line_of_a_narrow_terminal():
+    progress = Progress(quiet=True)
+    with progress.stage("openings verdict", 100) as advance:
+        for _ in range(3):
+            advance({"loss": 0.5, "psnr": 20.0})
+        console = Console(width=60, file=io.StringIO())
+        console.print(progress._bars.make_tasks_table(progress._bars.tasks))
+    assert len(console.file.getvalue().splitlines()) == 1
 
 
 def in_lines(monkeypatch: pytest.MonkeyPatch) -> Progress:
