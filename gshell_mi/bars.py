@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task
 
 Value = TypeVar("Value")
 
@@ -71,11 +71,15 @@ class Bars(Progress):
             yield value
             self.advance(task)
 
+    @property
+    def running(self) -> Task | None:
+        """The newest task that is not done; None if all are."""
+        return next((task for task in reversed(self.tasks) if not task.finished), None)
+
     def _tell(self) -> None:
         told, due = None, 0.0
         while not self._ended.wait(self._begun):
-            task = next((task for task in reversed(self.tasks) if not task.finished), None)
-            now = time.monotonic()
+            task, now = self.running, time.monotonic()
             if task is None or (task.id == told and now < due):
                 continue
             told, due = task.id, now + self._pause

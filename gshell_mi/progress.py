@@ -40,7 +40,7 @@ class Progress:
             _Detail(Column(no_wrap=True)),
             quiet=quiet,
         )
-        self._console, self._reference = self._bars.console, None
+        self._console = self._bars.console
 
     def __enter__(self) -> Progress:
         self._bars.start()
@@ -94,10 +94,9 @@ class Progress:
             self._console.print(f"{name}: took {took}", soft_wrap=True)
 
     def reference(self, done: int, total: int) -> None:
-        """Targets being rendered from a reference scene: ``done`` of ``total``."""
-        if self._reference is None:
-            self._reference = self._bars.add_task("targets", total=total, detail="")
-        self._bars.update(self._reference, completed=done, total=total, detail=f"{done}/{total} rendered")
+        """In the running stage targets are rendered from a reference scene: ``done`` of ``total``."""
+        if task := self._bars.running:
+            self._bars.update(task.id, completed=done, total=total, detail=f"{done}/{total} rendered")
 
 
 class _Detail(ProgressColumn):

@@ -191,9 +191,8 @@ def textured_part(
             "metallicRoughnessTexture": "occlusion_roughness_metallic",
         },
     }
-    images = {
-        name: getattr(textures, name) for name in ("base_color", "occlusion_roughness_metallic", "normal")
-    }
+    kinds = "base_color", "occlusion_roughness_metallic", "normal"
+    images = {kind: getattr(textures, kind) for kind in kinds}
     return Part(name, faces, attributes, material, images)
 
 

@@ -29,8 +29,8 @@ def normal_variation(normals: mi.Vector3f, faces: mi.Vector3u) -> mi.Float:
         normals: one per vertex.
         faces: vertex indices.
     """
-    corners = [gather(type(normals), normals, faces[i]) for i in range(3)]
     if not dr.width(faces):
         return mi.Float(0)
+    corners = [gather(type(normals), normals, faces[i]) for i in range(3)]
     lengths = (dr.sqrt(dr.squared_norm(corners[i] - corners[i - 1]) + _FLAT**2) - _FLAT for i in range(3))
     return sum(mean(length) for length in lengths) / 3

@@ -43,7 +43,7 @@ def test_at_the_centres_of_pixels_they_are_those_of_the_mask(views, alphas):
 
 
 def test_between_and_beyond_the_centres(views, alphas):
-    masks, alphas = MaskDistances(views, alphas), alphas
+    masks = MaskDistances(views, alphas)
     first = mask_distance(alphas[0], fill_holes=False)
     film = mi.Point2f([3.0 / 12, -0.5, 2.0], [2.0 / 7, -0.5, 2.0])
     found = masks.at(masks.plain, mi.UInt32(0, 0, 0), film).numpy()
