@@ -19,6 +19,7 @@ from .stages.joint import DetailConfig, JointConfig
 from .stages.occlusion import OcclusionConfig
 from .stages.openings import OpeningsConfig
 from .stages.refinement import FoldsConfig, RefinementConfig
+from .stages.smoothing import SmoothingConfig
 from .stages.texture import TextureConfig
 
 
@@ -126,6 +127,8 @@ class FitConfig:
     """Corrections of the poses."""
     detail: DetailConfig = field(default_factory=DetailConfig)
     """The joint stage continued on a finer lattice."""
+    smoothing: SmoothingConfig = field(default_factory=SmoothingConfig)
+    """Bumps that are noise."""
     texture: TextureConfig = field(default_factory=TextureConfig)
     """Colours as fine as the images."""
 
@@ -194,6 +197,7 @@ _PREVIEW = {
     "render.max_depth": 2,
     "model.even_start": False,
     "model.light_height": 16,
+    "smoothing.most": 0.0,
     "texture.rounds": 1,
     "joint.color_hold": 0.0,
     "openings.revise": False,

@@ -18,6 +18,7 @@ from .stages.poses import Poses
 from .stages.refinement import Refinement
 from .stages.revision import Revision
 from .stages.revoxelise import Revoxelise
+from .stages.smoothing import Smoothing
 from .stages.texture import Texture
 from .stages.volume import Volume
 
@@ -70,6 +71,8 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
         ]
     else:
         start.append(Joint("joint", config.joint, config.iterations, lattices.last))
+    if config.iterations and config.smoothing.most:
+        start.append(Smoothing(config.smoothing))  # what bumps are noise
     if config.iterations and config.texture.rounds:
         start.append(Texture(config.texture))  # colours as fine as the images
     return start

@@ -58,6 +58,7 @@ STAGES = _group(
         {"openings.revise": False},
     ),
     ("no-detail", "*detail*: a finer lattice", {"detail.iterations": 0}),
+    ("no-smoothing", "*smoothing*: bumps that are noise", {"smoothing.most": 0.0}),
     ("no-texture", "*texture*: colours as fine as the images", {"texture.rounds": 0}),
 )
 

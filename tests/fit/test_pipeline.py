@@ -15,7 +15,8 @@ from gshell_mi.fit.lattices import Lattices
 from gshell_mi.fit.pipeline import pipeline
 from gshell_mi.lattice import TetLattice
 
-END = ["poses", "revision", "detail", "alignment", "texture"]
+LAST = ["smoothing", "texture"]
+END = ["poses", "revision", "detail", "alignment", *LAST]
 START = ["light", "openings", "exposures", "cavities", "refinement", "folds", "revoxelise"]
 KEPT = [stage for stage in START if stage != "exposures"]
 GEOMETRY = [stage for stage in KEPT if stage != "light"]
@@ -33,24 +34,43 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
         ({}, ["occlusion", "hull", *START, "volume", "joint", *END]),
         ({"volume.iterations": 0}, ["occlusion", "hull", *START, "joint", *END]),
         ({"iterations": 0}, ["occlusion", "hull", *START, "volume", "joint"]),
-        ({"detail.iterations": 0}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
-        ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, "volume", "joint", "texture"]),
+        ({"detail.iterations": 0}, ["occlusion", "hull", *START, "volume", "joint", *LAST]),
+        ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, "volume", "joint", *LAST]),
         ({"exposures": "keep"}, ["occlusion", "hull", *KEPT, "volume", "joint", *END]),
         ({"geometry_only": True}, ["occlusion", "hull", *GEOMETRY, "volume", "joint", *END]),
         ({"light_frame": "world"}, ["occlusion", "hull", *START[1:], "volume", "joint", *END]),
         ({"known_light": True}, ["occlusion", "hull", *START[1:], "volume", "joint", *END]),
         ({"occlusion.most": 0.0}, ["hull", *START, "volume", "joint", *END]),
-        (
-            {"poses": "keep"},
-            ["occlusion", "hull", *START, "volume", "joint", "revision", "detail", "texture"],
-        ),
+        ({"poses": "keep"}, ["occlusion", "hull", *START, "volume", "joint", "revision", "detail", *LAST]),
         (
             {"openings.revise": False},
-            ["occlusion", "hull", *START, "volume", "joint", "poses", "detail", "alignment", "texture"],
+            [
+                "occlusion",
+                "hull",
+                *START,
+                "volume",
+                "joint",
+                "poses",
+                "detail",
+                "alignment",
+                "smoothing",
+                "texture",
+            ],
         ),
         (
             {"texture.rounds": 0},
-            ["occlusion", "hull", *START, "volume", "joint", "poses", "revision", "detail", "alignment"],
+            [
+                "occlusion",
+                "hull",
+                *START,
+                "volume",
+                "joint",
+                "poses",
+                "revision",
+                "detail",
+                "alignment",
+                "smoothing",
+            ],
         ),
         ({"model.field": "flexicubes"}, ["occlusion", "hull", *START, "volume", "joint", *END]),
     ],
@@ -62,10 +82,10 @@ def test_stages_from_masks(settings, expected):
 @pytest.mark.parametrize(
     ("opened", "settings", "expected"),
     [
-        (True, {}, ["given", "light", "exposures", "joint", "poses", "detail", "alignment", "texture"]),
-        (True, {"exposures": "keep"}, ["given", "light", "joint", "poses", "detail", "alignment", "texture"]),
-        (False, {}, ["given", *START, "joint", "poses", "detail", "alignment", "texture"]),
-        (True, {"watertight": True}, ["given", *START, "joint", "poses", "detail", "alignment", "texture"]),
+        (True, {}, ["given", "light", "exposures", "joint", "poses", "detail", "alignment", *LAST]),
+        (True, {"exposures": "keep"}, ["given", "light", "joint", "poses", "detail", "alignment", *LAST]),
+        (False, {}, ["given", *START, "joint", "poses", "detail", "alignment", *LAST]),
+        (True, {"watertight": True}, ["given", *START, "joint", "poses", "detail", "alignment", *LAST]),
     ],
 )
 def test_stages_from_given_fields(tmp_path, opened, settings, expected):

@@ -15,6 +15,7 @@ from ...fields.mask_distances import MaskDistances
 from ...fields.visual_hull import visual_hull
 from ...lattice import Lattice
 from ...scene import FitScene
+from ...template.denoise import denoised
 from ...template.sides import normals_at_vertices
 from ..surface import Seen, Surface
 from ..template import closed_template
@@ -23,6 +24,9 @@ from .volume import RadianceVolume
 #: The surface is this far outside of what is there, in cells: a sheet, which is seen from both sides, has no
 #: inside, and a lattice holds nothing thinner than about a cell. The joint stage takes it back where it can.
 _MARGIN = 0.6
+
+#: How far a surface that views vote for may be off, in cells: they vote at vertices, which are a cell apart.
+_ERROR = 0.4
 
 #: Largest distance that is told from others, in cells.
 _TRUNCATION = 3.0
@@ -78,8 +82,12 @@ def volume_surface(
         mi.Point3f(points.numpy()[:, near]), views, depths, truncation=_TRUNCATION * cell, share=_VOTES
     )
     distance[near] = np.maximum(distance[near], inside.numpy())
-    outside = without_specks((distance / cell).reshape((lattice.stride,) * 3), margin) - margin
-    sdf = closed_at_border(lattice.spacing * outside.ravel(), lattice)
+    sdf = closed_at_border(lattice.spacing * (distance / cell - margin), lattice)
+    if not (sdf < 0).any():
+        return None
+    cells = denoised(sdf, lattice, _ERROR) / lattice.spacing
+    cells = without_specks(cells.reshape((lattice.stride,) * 3), 0.0).ravel()
+    sdf = closed_at_border(lattice.spacing * cells, lattice)
     if not (sdf < 0).any():
         return None
     mesh, vertices, faces = closed_template(subject, sdf, lattice)
