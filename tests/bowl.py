@@ -61,6 +61,8 @@ CLOSED = (
     "4",
     "--refinement.iterations",
     "2",
+    "--smoothing.most",
+    "0",
     "--openings.no-revise",
 )
 
