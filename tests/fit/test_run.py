@@ -126,7 +126,9 @@ def test_metrics(whole):
     assert metrics["psnr_training"] > 15
     assert metrics["config"]["openings"]["iterations"] == 100 and metrics["config"]["seed"] == 0
     assert metrics["versions"]["mitsuba"] == mi.__version__
-    assert {"hull", "openings", "cavities", "refinement", "joint", "smoothing", "total"} <= set(metrics["seconds"])
+    assert {"hull", "openings", "cavities", "refinement", "joint", "smoothing", "total"} <= set(
+        metrics["seconds"]
+    )
 
 
 @pytest.mark.parametrize("kept", [False, True])

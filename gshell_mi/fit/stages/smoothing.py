@@ -7,6 +7,7 @@ from typing import Annotated
 
 from ...template.denoise import denoised
 from ..bounds import Between
+from ..radiance.shown import Shown
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface
@@ -37,22 +38,22 @@ class Smoothing:
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface without bumps that are noise, and with material and light as they were."""
-        start, fields, taken, verdicts = surface, surface.fields, 0.0, []
+        found, cells, verdicts = surface, 0.0, []
         with steps.task():
-            shown = fit.judge.shown(_mesh(fit, surface))
-            for tolerance in (self.config.most * fraction for fraction in _FRACTIONS):
-                sdf = denoised(fields.sdf, start.lattice, tolerance, fields.deform)
-                other = start.with_fields(sdf=sdf)
-                then = fit.judge.shown(_mesh(fit, other))
-                verdict = fit.judge.compare(shown.whole, then.whole)
+            before = _shown(fit, surface)
+            for error in (self.config.most * fraction for fraction in _FRACTIONS):
+                fields = surface.fields
+                other = surface.with_fields(sdf=denoised(fields.sdf, fields.lattice, error, fields.deform))
+                after = _shown(fit, other)
+                verdict = fit.judge.compare(before.whole, after.whole)
                 verdicts.append(verdict.facts())
                 if not verdict.accepted[0]:
                     break
-                surface, shown, taken = other, then, tolerance
+                found, before, cells = other, after, error
         steps.fact("smoothing_verdicts", verdicts)
-        steps.fact("smoothed_cells", taken)
-        return surface
+        steps.fact("smoothed_cells", cells)
+        return found
 
 
-def _mesh(fit: Fit, surface: Surface):
-    return fit.scene.subject.surface_of(surface.fields).to_numpy()[:2]
+def _shown(fit: Fit, surface: Surface) -> Shown:
+    return fit.judge.shown(fit.scene.subject.surface_of(surface.fields).to_numpy()[:2])
