@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+import mitsuba as mi
+
 from ...template.denoise import denoised
+from ...template.msdf import without_specks
 from ..bounds import Between
 from ..radiance.shown import Shown
 from ..runner import Steps
@@ -52,8 +55,15 @@ class Smoothing:
                 found, before, cells = other, after, error
         steps.fact("smoothing_verdicts", verdicts)
         steps.fact("smoothed_cells", cells)
-        return found
+        return surface if found is surface else _without_specks(fit, found)
 
 
 def _shown(fit: Fit, surface: Surface) -> Shown:
     return fit.judge.shown(fit.scene.subject.surface_of(surface.fields).to_numpy()[:2])
+
+
+def _without_specks(fit: Fit, surface: Surface) -> Surface:
+    """The surface without cuts and islands that are too small, as the joint stage leaves it."""
+    template, fields = fit.scene.subject.surface_of(surface.fields, template=True), surface.fields
+    msdf = without_specks(mi.Float(fields.msdf), template, fields.lattice, fit.config.topology.min_area)
+    return surface.with_fields(msdf=msdf.numpy())
