@@ -121,7 +121,7 @@ def test_geometry_only_shades_faces_flat(scene):
 def test_watertight(scene, tmp_path):
     """The open bowl, told to be closed: no openings, no boundary, and it is as closed as its template."""
     output = tmp_path / "out"
-    metrics = fit(scene, output, "--watertight", "--iterations", "4")
+    metrics = fit(scene, output, "--watertight", "--iterations", "4", "--poses", "keep")
     assert metrics["counts"]["boundary_loops"] == metrics["counts"]["pinholes"] == 0
     found = trimesh.load(output / "mesh.ply", process=False)
     assert found.is_watertight
