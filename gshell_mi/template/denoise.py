@@ -43,7 +43,7 @@ def denoised(
     adam = mi.ad.Adam(lr=_RATE, uniform=True, params={"cells": cells})
     for step in range(_STEPS):
         mesh = extract(lattice, adam["cells"] * lattice.spacing, deform=offsets)
-        if mesh.is_empty:
+        if mesh.is_empty:  # nothing was there, or all that was is noise
             break
         dr.backward(losses.normal_variation(mesh.vertex_normals(), mesh.faces))
         dr.set_grad(adam["cells"], trusted(dr.grad(adam["cells"]), _MOST))

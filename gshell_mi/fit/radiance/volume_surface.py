@@ -83,8 +83,6 @@ def volume_surface(
     )
     distance[near] = np.maximum(distance[near], inside.numpy())
     sdf = closed_at_border(lattice.spacing * (distance / cell - margin), lattice)
-    if not (sdf < 0).any():
-        return None
     cells = denoised(sdf, lattice, _ERROR) / lattice.spacing
     cells = without_specks(cells.reshape((lattice.stride,) * 3), 0.0).ravel()
     sdf = closed_at_border(lattice.spacing * cells, lattice)

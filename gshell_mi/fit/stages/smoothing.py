@@ -41,11 +41,10 @@ class Smoothing:
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface without bumps that are noise, and with material and light as they were."""
-        found, cells, verdicts = surface, 0.0, []
+        fields, found, cells, verdicts = surface.fields, surface, 0.0, []
         with steps.task():
             before = _shown(fit, surface)
             for error in (self.config.most * fraction for fraction in _FRACTIONS):
-                fields = surface.fields
                 other = surface.with_fields(sdf=denoised(fields.sdf, fields.lattice, error, fields.deform))
                 after = _shown(fit, other)
                 verdict = fit.judge.compare(before.whole, after.whole)
