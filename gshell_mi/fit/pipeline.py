@@ -9,6 +9,7 @@ from .lattices import Lattices
 from .stage import Stage
 from .stages.cavities import Cavities
 from .stages.exposures import Exposures
+from .stages.fine_folds import FineFolds
 from .stages.hull import Given, Hull
 from .stages.joint import Joint
 from .stages.light_frame import LightFrame
@@ -54,7 +55,10 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
             Revoxelise(),  # fields of what has moved
         ]
     if config.volume.iterations and not given:
-        start.append(Volume(config.volume))  # another start, if it is better
+        start += [
+            Volume(config.volume),  # another start, if it is better
+            FineFolds(config.folds),  # details that its lattice holds
+        ]
     # Networks are not tied to a lattice: theirs is the last one from the start.
     explicit = parametrisation_named(config.model.field).is_explicit
     refines = config.poses == "refine"

@@ -74,18 +74,20 @@ def template_of(subject: mi.Shape, surface: Surface, *, like: Template | None = 
 
     Args:
         subject: the gshell shape, in whose place it is.
-        surface: with its hull. Offsets of the lattice's vertices are left out.
+        surface: offsets of the lattice's vertices are left out.
         like: a template before a change of shape, whose opacity the new one takes over. New parts are solid.
     """
     lattice, fields = surface.lattice, surface.fields
     mesh, vertices, faces = closed_template(subject, fields.sdf, lattice)
-    logits, excess = (mesh.interpolate(mi.Float(field)).numpy() for field in (fields.msdf, surface.hull))
-    logits = logits / lattice.spacing
+    logits = mesh.interpolate(mi.Float(fields.msdf)).numpy() / lattice.spacing
     if like is not None:
         distance, nearest = cKDTree(like.vertices).query(vertices)
         near = distance < _REACH * lattice.spacing * subject.length_scale
         logits = np.where(near, like.logits[nearest], CERTAIN)
-    start = back_on_solid(vertices, faces, np.where(logits > 0, subject.length_scale * excess, 0))
+    start = vertices
+    if surface.hull is not None:
+        excess = mesh.interpolate(mi.Float(surface.hull)).numpy()
+        start = back_on_solid(vertices, faces, np.where(logits > 0, subject.length_scale * excess, 0))
     return Template(mesh, vertices, faces, logits, start)
 
 

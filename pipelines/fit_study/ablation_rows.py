@@ -40,7 +40,7 @@ STAGES = _group(
         "*refinement*, and *folds*: whole parts move to where the images agree",
         {"refinement.iterations": 0},
     ),
-    ("no-folds", "*folds*: the same for details", {"folds.iterations": 0}),
+    ("no-folds", "*folds*, and *fine_folds*: the same for details", {"folds.iterations": 0}),
     (
         "no-volume",
         "*volume*: another start, for gaps and struts that no hull shows",

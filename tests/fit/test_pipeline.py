@@ -31,17 +31,20 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({}, ["occlusion", "hull", *START, "volume", "joint", *END]),
+        ({}, ["occlusion", "hull", *START, "volume", "fine_folds", "joint", *END]),
         ({"volume.iterations": 0}, ["occlusion", "hull", *START, "joint", *END]),
-        ({"iterations": 0}, ["occlusion", "hull", *START, "volume", "joint"]),
-        ({"detail.iterations": 0}, ["occlusion", "hull", *START, "volume", "joint", *LAST]),
-        ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, "volume", "joint", *LAST]),
-        ({"exposures": "keep"}, ["occlusion", "hull", *KEPT, "volume", "joint", *END]),
-        ({"geometry_only": True}, ["occlusion", "hull", *GEOMETRY, "volume", "joint", *END]),
-        ({"light_frame": "world"}, ["occlusion", "hull", *START[1:], "volume", "joint", *END]),
-        ({"known_light": True}, ["occlusion", "hull", *START[1:], "volume", "joint", *END]),
-        ({"occlusion.most": 0.0}, ["hull", *START, "volume", "joint", *END]),
-        ({"poses": "keep"}, ["occlusion", "hull", *START, "volume", "joint", "revision", "detail", *LAST]),
+        ({"iterations": 0}, ["occlusion", "hull", *START, "volume", "fine_folds", "joint"]),
+        ({"detail.iterations": 0}, ["occlusion", "hull", *START, "volume", "fine_folds", "joint", *LAST]),
+        ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, "volume", "fine_folds", "joint", *LAST]),
+        ({"exposures": "keep"}, ["occlusion", "hull", *KEPT, "volume", "fine_folds", "joint", *END]),
+        ({"geometry_only": True}, ["occlusion", "hull", *GEOMETRY, "volume", "fine_folds", "joint", *END]),
+        ({"light_frame": "world"}, ["occlusion", "hull", *START[1:], "volume", "fine_folds", "joint", *END]),
+        ({"known_light": True}, ["occlusion", "hull", *START[1:], "volume", "fine_folds", "joint", *END]),
+        ({"occlusion.most": 0.0}, ["hull", *START, "volume", "fine_folds", "joint", *END]),
+        (
+            {"poses": "keep"},
+            ["occlusion", "hull", *START, "volume", "fine_folds", "joint", "revision", "detail", *LAST],
+        ),
         (
             {"openings.revise": False},
             [
@@ -49,6 +52,7 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
                 "hull",
                 *START,
                 "volume",
+                "fine_folds",
                 "joint",
                 "poses",
                 "detail",
@@ -64,6 +68,7 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
                 "hull",
                 *START,
                 "volume",
+                "fine_folds",
                 "joint",
                 "poses",
                 "revision",
@@ -72,7 +77,7 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
                 "smoothing",
             ],
         ),
-        ({"model.field": "flexicubes"}, ["occlusion", "hull", *START, "volume", "joint", *END]),
+        ({"model.field": "flexicubes"}, ["occlusion", "hull", *START, "volume", "fine_folds", "joint", *END]),
     ],
 )
 def test_stages_from_masks(settings, expected):

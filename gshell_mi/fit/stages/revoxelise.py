@@ -36,14 +36,20 @@ class Revoxelise:
         back."""
         surface = surface.on_grid(fit.lattices.late.grid)
         with steps.task():
-            template = template_of(fit.scene.subject, surface)
-            radiance = template.mesh.interpolate(mi.Float(surface.seen.radiance.ravel()), 3).numpy().T
-            still = Moved("start", template.start, radiance)
-            found, taken = _taken(fit, template, (*surface.moved, still), surface, steps)
+            found, taken = best_moved(fit, surface, steps)
             steps.fact("refinement_kept", taken not in ("start", ""))
             if taken == "folds":
                 steps.fact("folds_kept", True)
-            return without_unseen_parts(fit, replace(found, hull=None, moved=()))
+            return found
+
+
+def best_moved(fit: Fit, surface: Surface, steps: Steps) -> tuple[Surface, str]:
+    """The surface where its template has been moved to, and the stage that has; see ``Revoxelise``."""
+    template = template_of(fit.scene.subject, surface)
+    radiance = template.mesh.interpolate(mi.Float(surface.seen.radiance.ravel()), 3).numpy().T
+    still = Moved("start", template.start, radiance)
+    found, taken = _taken(fit, template, (*surface.moved, still), surface, steps)
+    return without_unseen_parts(fit, replace(found, hull=None, moved=())), taken
 
 
 def _taken(
@@ -62,12 +68,12 @@ def _taken(
         closed_up = closed_up or (found, stage)
     if closed_up is None:
         return whole
-    verdict = _compared(fit, whole[0], closed_up[0])
+    verdict = compared(fit, whole[0], closed_up[0])
     steps.fact("closed_loops_verdict", verdict.facts())
     return closed_up if verdict.accepted[0] else whole
 
 
-def _compared(fit: Fit, before: Surface, after: Surface) -> Verdict:
+def compared(fit: Fit, before: Surface, after: Surface) -> Verdict:
     """How much better one surface explains unseen views than another."""
     subject = fit.scene.subject
     return fit.judge.decide(*(subject.surface_of(each.fields).to_numpy()[:2] for each in (before, after)))
@@ -87,7 +93,7 @@ def _made(
         if cuts[0].topology.components > cuts[-1].topology.components:
             # What falls apart may be islands, which sides too many have held together.
             both = list(made)
-            if len(both) > 1 and _compared(fit, both[0][0], both[1][0]).accepted[0]:
+            if len(both) > 1 and compared(fit, both[0][0], both[1][0]).accepted[0]:
                 both.reverse()
             yield from both
         else:

@@ -70,7 +70,7 @@ def test_a_cut_that_falls_apart_counts_unless_views_deny_it(pieces, gain, first,
         revoxelise, "_revoxelised", lambda fit, template, moved, cut, start: (cut.name, "folds", True)
     )
     monkeypatch.setattr(
-        revoxelise, "_compared", lambda *given: Verdict(*(np.array([x]) for x in (1.0, 1.0, gain, 1.0)))
+        revoxelise, "compared", lambda *given: Verdict(*(np.array([x]) for x in (1.0, 1.0, gain, 1.0)))
     )
     template = SimpleNamespace(vertices=np.zeros((1, 3)))
     moved = SimpleNamespace(positions=np.ones((1, 3)))
