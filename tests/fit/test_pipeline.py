@@ -15,6 +15,7 @@ from gshell_mi.fit.lattices import Lattices
 from gshell_mi.fit.pipeline import pipeline
 from gshell_mi.lattice import TetLattice
 
+VOLUME = ["volume", "fine_folds"]
 LAST = ["smoothing", "texture"]
 END = ["poses", "revision", "detail", "alignment", *LAST]
 START = ["light", "openings", "exposures", "cavities", "refinement", "folds", "revoxelise"]
@@ -31,28 +32,24 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({}, ["occlusion", "hull", *START, "volume", "fine_folds", "joint", *END]),
+        ({}, ["occlusion", "hull", *START, *VOLUME, "joint", *END]),
         ({"volume.iterations": 0}, ["occlusion", "hull", *START, "joint", *END]),
-        ({"iterations": 0}, ["occlusion", "hull", *START, "volume", "fine_folds", "joint"]),
-        ({"detail.iterations": 0}, ["occlusion", "hull", *START, "volume", "fine_folds", "joint", *LAST]),
-        ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, "volume", "fine_folds", "joint", *LAST]),
-        ({"exposures": "keep"}, ["occlusion", "hull", *KEPT, "volume", "fine_folds", "joint", *END]),
-        ({"geometry_only": True}, ["occlusion", "hull", *GEOMETRY, "volume", "fine_folds", "joint", *END]),
-        ({"light_frame": "world"}, ["occlusion", "hull", *START[1:], "volume", "fine_folds", "joint", *END]),
-        ({"known_light": True}, ["occlusion", "hull", *START[1:], "volume", "fine_folds", "joint", *END]),
-        ({"occlusion.most": 0.0}, ["hull", *START, "volume", "fine_folds", "joint", *END]),
-        (
-            {"poses": "keep"},
-            ["occlusion", "hull", *START, "volume", "fine_folds", "joint", "revision", "detail", *LAST],
-        ),
+        ({"iterations": 0}, ["occlusion", "hull", *START, *VOLUME, "joint"]),
+        ({"detail.iterations": 0}, ["occlusion", "hull", *START, *VOLUME, "joint", *LAST]),
+        ({"model.field": "hashgrid"}, ["occlusion", "hull", *START, *VOLUME, "joint", *LAST]),
+        ({"exposures": "keep"}, ["occlusion", "hull", *KEPT, *VOLUME, "joint", *END]),
+        ({"geometry_only": True}, ["occlusion", "hull", *GEOMETRY, *VOLUME, "joint", *END]),
+        ({"light_frame": "world"}, ["occlusion", "hull", *START[1:], *VOLUME, "joint", *END]),
+        ({"known_light": True}, ["occlusion", "hull", *START[1:], *VOLUME, "joint", *END]),
+        ({"occlusion.most": 0.0}, ["hull", *START, *VOLUME, "joint", *END]),
+        ({"poses": "keep"}, ["occlusion", "hull", *START, *VOLUME, "joint", "revision", "detail", *LAST]),
         (
             {"openings.revise": False},
             [
                 "occlusion",
                 "hull",
                 *START,
-                "volume",
-                "fine_folds",
+                *VOLUME,
                 "joint",
                 "poses",
                 "detail",
@@ -67,8 +64,7 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
                 "occlusion",
                 "hull",
                 *START,
-                "volume",
-                "fine_folds",
+                *VOLUME,
                 "joint",
                 "poses",
                 "revision",
@@ -77,7 +73,7 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
                 "smoothing",
             ],
         ),
-        ({"model.field": "flexicubes"}, ["occlusion", "hull", *START, "volume", "fine_folds", "joint", *END]),
+        ({"model.field": "flexicubes"}, ["occlusion", "hull", *START, *VOLUME, "joint", *END]),
     ],
 )
 def test_stages_from_masks(settings, expected):

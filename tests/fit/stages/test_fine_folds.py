@@ -24,22 +24,25 @@ def fit(exact):
     return Fit(exact.scene, config, Lattices.of(exact.scene.subject, config))
 
 
+def with_fields(surface, fields):
+    """The surface with fields on some lattice, all white."""
+    count = fields.lattice.vertex_count
+    white = Seen(np.ones((count, 3), np.float32), np.ones(count, bool), np.float32(1))
+    return replace(surface, fields=fields, hull=None, seen=white)
+
+
 @pytest.fixture(scope="module")
 def hull(fit):
     """The bowl with a lid, on the coarse lattice."""
-    hull = replace(Hull(fit.config.hull).run(fit, None, Silent()), hull=None)
-    count = hull.lattice.vertex_count
-    return replace(hull, seen=Seen(np.ones((count, 3), np.float32), np.ones(count, bool), np.float32(1)))
+    hull = Hull(fit.config.hull).run(fit, None, Silent())
+    return with_fields(hull, hull.fields)
 
 
 @pytest.fixture(scope="module")
 def fine(fit, hull):
     """The same on the finer one."""
     lattice = fit.lattices.volume
-    fields = hull.fields.to_lattice(lattice.resolution, lattice.grid)
-    count = lattice.vertex_count
-    seen = Seen(np.ones((count, 3), np.float32), np.ones(count, bool), np.float32(1))
-    return replace(hull, fields=fields, seen=seen)
+    return with_fields(hull, hull.fields.to_lattice(lattice.resolution, lattice.grid))
 
 
 def verdict(gain):
