@@ -37,8 +37,8 @@ _INTRODUCTION = """\
 
 Made from the code by `python pipelines/command_reference.py`; each command's `--help` says the same. All
 leave with exit code 0 on success and 2 on a mistake in what they were given: one sentence on stderr tells
-which, and how to mend it. `python -m gshell_mi.doctor` tells whether this machine can run them. Each is
-installed under a shorter name too: `gshell-fit` is `python -m gshell_mi.fit`.
+which, and how to mend it. `python -m gshell_mi.doctor` tells whether this machine can run them. All but
+`generate.evaluate` are installed under a shorter name too: `gshell-fit` is `python -m gshell_mi.fit`.
 """
 
 

@@ -26,7 +26,7 @@ class TrainConfig:
     autoencoder: Path | None = None
     """Folder of a trained model of this size whose autoencoder is taken; only the flow is trained then."""
     mirror: bool = True
-    """Objects also count with left and right exchanged."""
+    """Objects also count with left and right exchanged; --no-mirror: as they are."""
     seed: int = 0
     """Of weights, order and noise."""
     device: str = "auto"

@@ -44,7 +44,7 @@ class TurntableConfig:
     wireframe: bool = False
     """Draw the edges of the triangles."""
     denoise: bool = True
-    """Filter path-traced pictures with Open Image Denoise, if it is installed."""
+    """Filter path-traced pictures with Open Image Denoise, if it is installed; --no-denoise: do not."""
 
     def __post_init__(self) -> None:
         for name in ("frames", "size", "spp"):

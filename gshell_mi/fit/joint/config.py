@@ -37,8 +37,8 @@ class ModelConfig:
     """What the geometry is optimised as: the lattice's values themselves, or a parametrisation that is
     registered under this name (gshell_mi.extras has some)."""
     even_start: bool = True
-    """Start from one base colour, the median of those that the images show, if the light is sought;
-    otherwise from what they show, shading and all."""
+    """Start from one base colour, the median of those that the images show, if the light is sought.
+    With --model.no-even-start, or a known light: from what they show, shading and all."""
     light_height: Annotated[int, Between(3)] = 32
     """Rows of the optimised environment map; it has twice as many columns."""
 

@@ -64,7 +64,7 @@ class OpeningsConfig:
     rounds: int = 3
     """How often, at most, the steps are done again for what wrong openings have hidden."""
     revise: bool = True
-    """Ask once more when the joint stage has moved the surface."""
+    """Ask once more when the joint stage has moved the surface; --openings.no-revise: do not."""
 
 
 class Openings:
