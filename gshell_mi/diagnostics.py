@@ -10,7 +10,7 @@ import numpy as np
 
 from .arrays import ArrayT
 from .compat import mesh_scene
-from .topology import topology, vertex_components
+from .topology import mesh_components, topology
 from .triangles import area_vectors, unit
 from .views import PinholeViews
 from .visibility import best_view
@@ -131,7 +131,7 @@ def diagnose(
 
 def _floaters(vertex_count: int, faces: np.ndarray, area: np.ndarray) -> int:
     """Connected components of little area."""
-    label = vertex_components(faces[:, [0, 1, 1, 2]].reshape(-1, 2), vertex_count)[1][faces[:, 0]]
+    label = mesh_components(faces, vertex_count)[faces[:, 0]]
     areas = np.bincount(label, area)
     return int(((areas > 0) & (areas < FLOATER * area.sum())).sum())
 

@@ -64,7 +64,8 @@ class PixelPool:
         views: the cameras.
         targets: their images.
         chosen: indices of the views whose pixels are drawn; default all.
-        off_outline: leaves out pixels nearer to a mask's outline than this many pixels.
+        off_outline: leaves out pixels nearer to a mask's outline than this many pixels, in views that show
+            more of the object than that.
     """
 
     def __init__(
@@ -76,10 +77,7 @@ class PixelPool:
     ):
         chosen = np.arange(len(views)) if chosen is None else chosen
         targets = [targets[index] for index in chosen]
-        places = [
-            _tiled(_near_object(target) & _known(target) & ~_on_outline(target, off_outline))
-            for target in targets
-        ]
+        places = [_tiled(_drawn(target, off_outline)) for target in targets]
         rgba = np.concatenate([target.rgba[*place.T] for target, place in zip(targets, places, strict=True)])
         self._pixels = mi.Float(rgba.ravel())
         self._view = mi.UInt32(np.repeat(chosen, [len(place) for place in places]))
@@ -140,6 +138,13 @@ def _tiled(chosen: np.ndarray) -> np.ndarray:
     place = np.argwhere(chosen)
     row, column = place.T // _TILE
     return place[np.lexsort((column, row))]
+
+
+def _drawn(target: Target, off_outline: int) -> np.ndarray:
+    """(height, width) which pixels may be drawn. Of what is all outline, as a twig is, all are."""
+    drawn = _near_object(target) & _known(target)
+    inside = drawn & ~_on_outline(target, off_outline)
+    return inside if (inside & (target.rgba[..., 3] > 0.5)).any() else drawn
 
 
 def _near_object(target: Target) -> np.ndarray:

@@ -38,6 +38,11 @@ class Target:
             object.__setattr__(self, "known", np.ones(self.rgba.shape[:2], np.float32))
 
     @property
+    def is_known(self) -> bool:
+        """Whether all of every pixel is known."""
+        return bool((np.asarray(self.known) >= 1).all())
+
+    @property
     def most_alpha(self) -> np.ndarray:
         """(height, width) the largest coverage that what is known allows."""
         return np.maximum(self.rgba[..., 3], 1 - np.asarray(self.known))
@@ -112,10 +117,10 @@ def load_target(path: Path, width: int, height: int) -> Target:
 
 
 def mean_radiance(targets: list[Target]) -> float:
-    """Of what targets cover, over their pixels and channels."""
+    """Of what targets cover, over their pixels and channels; a little where all is black."""
     color = sum(float(target.rgba[..., :3].sum(dtype=np.float64)) for target in targets)
     coverage = sum(float(target.rgba[..., 3].sum(dtype=np.float64)) for target in targets)
-    return color / max(3 * coverage, 1e-6)
+    return max(color / max(3 * coverage, 1e-6), 1e-6)
 
 
 def depth_file(path: Path) -> Path | None:

@@ -103,6 +103,7 @@ def fit_of(subject: mi.Shape, shape: trimesh.Trimesh, config: FitConfig = CONFIG
         judge=judges[0],
         validation_judge=judges[1],
         cell=lambda surface: surface.lattice.spacing * subject.length_scale,
+        mesh=lambda surface: subject.surface_of(surface.fields).to_numpy()[:2],
     )
 
 

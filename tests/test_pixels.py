@@ -87,3 +87,15 @@ def test_a_step_draws_the_same_again_and_another_step_others(drawn):
     again, other = (pool.sample(1 << 16, seed=3, step=step).film.numpy() for step in (5, 6))
     np.testing.assert_array_equal(again, sample.film.numpy())
     assert (other != again).any(axis=0).mean() > 0.99
+
+
+def test_of_what_is_all_outline_all_is_drawn():
+    plate, twig = (np.zeros((height, width, 4), np.float32) for width, height in SIZES)
+    plate[10:40, 10:50], twig[:, 40:45] = 1, 1
+    pool = PixelPool(views(), [Target(None, rgba, True) for rgba in (plate, twig)], off_outline=3)
+    sample = pool.sample(1 << 14, seed=3, step=5)
+    column, row = np.floor(sample.film.numpy() * np.array(SIZES)[sample.view.numpy()].T)
+    of_plate = sample.view.numpy() == 0
+    assert (column[of_plate].min(), column[of_plate].max()) == (13, 46)
+    assert (row[of_plate].min(), row[of_plate].max()) == (13, 36)
+    assert column[~of_plate].min() < 40 and column[~of_plate].max() > 44

@@ -1,11 +1,13 @@
 """What a target image may be, and what it is turned into."""
 
+from pathlib import Path
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from gshell_mi import UserError
-from gshell_mi.targets import load_target
+from gshell_mi.targets import Target, load_target
 
 
 @pytest.fixture
@@ -94,3 +96,10 @@ def test_alpha_is_coverage(write, pixels, alpha):
     pixels[1, 1, 3] = alpha
     with pytest.raises(UserError, match=rf"alpha between .*{alpha}.*; alpha is coverage"):
         load_target(write(pixels), 7, 5)
+
+
+@pytest.mark.parametrize(("share", "whole"), [(1.0, True), (0.3, False), (0.0, False)])
+def test_a_target_is_known_if_every_pixel_wholly_is(pixels, share, whole):
+    known = np.ones(pixels.shape[:2], np.float32)
+    known[0] = share
+    assert Target(Path("a.exr"), pixels, True, known=known).is_known == whole

@@ -101,7 +101,7 @@ class Preparation:
             camera,
             _clipped(pixels, coverage),
             float(coverage.max()),
-            None if known.all() else known,
+            None if (known >= 1).all() else known,
         )
 
     def _known(self, frame: Frame, coverage: np.ndarray, reduction: int) -> np.ndarray:

@@ -36,9 +36,9 @@ class _Arguments:
     alone."""
     effort: Effort = "normal"
     """How much work the fit is. preview is a rough result in about a minute: a coarser lattice, fewer steps
-    and samples, no refinement, no mesh.glb or report.html. thorough takes twice as many steps of every stage,
-    and ends on twice as many cells per side if it starts from a radiance volume. What else is given on the
-    command line still counts."""
+    and samples, no refinement, no radiance volume, no mesh.glb or report.html. thorough takes twice as many
+    steps of every stage, and ends on twice as many cells per side if it starts from a radiance volume. What
+    else is given on the command line still counts."""
     no_report: bool = False
     """Leave out mesh.glb and report.html, which take some seconds."""
     quiet: bool = False

@@ -89,11 +89,11 @@ class Verdict:
         """On some of the places, as if no others had been asked for."""
         return Verdict(self.before[places], self.after[places], self.gain[places], self.noise[places])
 
-    def facts(self) -> dict[str, list[float]]:
-        """For ``metrics.json``: gain and noise of each place."""
+    def facts(self) -> dict[str, list[float | None]]:
+        """For ``metrics.json``: gain and noise of each place; no noise where hardly a view tells."""
         return {
             "gain": [round(float(value), 5) for value in self.gain],
-            "noise": [round(float(value), 5) if np.isfinite(value) else -1.0 for value in self.noise],
+            "noise": [round(float(value), 5) if np.isfinite(value) else None for value in self.noise],
         }
 
 

@@ -92,9 +92,8 @@ class MemoryEstimate:
             volume=_PER_SQUARE_VOXEL * config.volume.side**2 if config.volume.iterations else 0,
             rays=max(
                 _PER_RAY * config.radiance.batch,
-                _PER_RAY * config.cavities.batch,
-                _PER_RAY * config.volume.batch,
-                _PER_SIGHTING * config.cameras.places * len(pixels),
+                *(_PER_RAY * fog.batch for fog in (config.cavities, config.volume) if fog.iterations),
+                _PER_SIGHTING * config.cameras.places * len(pixels) if config.poses == "refine" else 0,
             ),
             light=_PER_TEXEL * 2 * config.model.light_height**2,
         )

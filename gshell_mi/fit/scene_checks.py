@@ -24,8 +24,8 @@ def check_given(scene: FitScene, config: FitConfig) -> None:
     """Whether the scene gives what the modes of the fit take from it.
 
     Raises:
-        UserError: the material is to be kept, but there is none; the given fields hold no surface; or there
-            is a second emitter.
+        UserError: the material is to be kept, but there is none; the given fields hold no surface; a
+            known light shall turn with the camera; or there is a second emitter.
     """
     others = [emitter.id() for emitter in scene.scene.emitters() if emitter.id() != "light"]
     if others:
@@ -33,6 +33,11 @@ def check_given(scene: FitScene, config: FitConfig) -> None:
             f"Scene '{scene.path}' has another emitter beside 'light' ('{others[0]}'); a fit "
             f"explains the images by one environment: take it out, and its light is found as "
             f"part of that."
+        )
+    if config.known_light and config.light_frame == "camera":
+        raise UserError(
+            "--known-light keeps the light where the scene has it, and --light-frame camera turns it with "
+            "every view; leave one of them out."
         )
     if scene.subject.surface.is_empty:
         raise UserError(

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from .config import FitConfig
     from .runner import Steps
 
-#: Every eighth view validates what the others are fitted to; what ``--hold-out`` keeps no stage sees at all.
+#: Every eighth view validates what the colours of the others have moved; what ``--hold-out`` keeps no stage
+#: sees at all.
 _VALIDATION = 8
 
 
@@ -73,7 +74,7 @@ class Fit:
 
     @cached_property
     def training(self) -> PixelPool:
-        """The pixels of the views that shapes are fitted to; the others validate them."""
+        """The pixels of the views whose colours the refinement knows; the others validate it."""
         return PixelPool(self.views, self.scene.targets, self._validation[0])
 
     @cached_property
@@ -92,7 +93,7 @@ class Fit:
 
     @property
     def _validation(self) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of the views that shapes are fitted to, and of the others."""
+        """Indices of the views of ``training``, and of the others."""
         every = np.arange(len(self.views))
         validation = every[::_VALIDATION]
         return np.setdiff1d(every, validation) if len(every) > 1 else every, validation
@@ -121,6 +122,11 @@ class Fit:
             sensors = Corrections.from_array(surface.poses).sensors(sensors)
         turns = self.light_turns if surface.light_turns is None else bool(surface.light_turns)
         return replace(self, scene=replace(self.scene, sensors=sensors, targets=targets), light_turns=turns)
+
+    def mesh(self, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+        """A surface's vertices (V, 3), in world units, and faces (F, 3)."""
+        vertices, faces, _ = self.scene.subject.surface_of(surface.fields).to_numpy()
+        return vertices, faces
 
     def cell(self, surface: Surface) -> float:
         """Side of a cell of a surface's lattice in world units."""

@@ -16,7 +16,7 @@ from ..template.msdf import CERTAIN
 from ..triangles import positive_part
 from .surface import Surface
 
-#: A template takes its opacity from another one that is at most this many cells away ...
+#: A template takes its opacity from another one that is at most this many cells away.
 _REACH = 1.5
 
 

@@ -20,7 +20,11 @@ _MOST = 10.0
 
 
 def denoised(
-    sdf: np.ndarray, lattice: Lattice | BlockLattice, tolerance: float, deform: np.ndarray | None = None
+    sdf: np.ndarray,
+    lattice: Lattice | BlockLattice,
+    tolerance: float,
+    deform: np.ndarray | None = None,
+    weights: np.ndarray | None = None,
 ) -> np.ndarray:
     """Takes from a surface the bumps that are no larger than its error.
 
@@ -33,16 +37,17 @@ def denoised(
         lattice: what they live on.
         tolerance: how far the surface may be off, in cells.
         deform: (3 n,) offsets of the vertices; None for none.
+        weights: of FlexiCubes, as of ``extract``; None for equal ones.
 
     Returns:
         (n,) signed distances. Those of vertices beside no surface are as they were.
     """
     cells = mi.Float(sdf / lattice.spacing)
-    offsets = None if deform is None else mi.Float(deform)
+    offsets, of_cubes = (None if given is None else mi.Float(given) for given in (deform, weights))
     # One step size for all: where it is flat, the little that derivatives are would move whole sides.
     adam = mi.ad.Adam(lr=_RATE, uniform=True, params={"cells": cells})
     for step in range(_STEPS):
-        mesh = extract(lattice, adam["cells"] * lattice.spacing, deform=offsets)
+        mesh = extract(lattice, adam["cells"] * lattice.spacing, deform=offsets, weights=of_cubes)
         if mesh.is_empty:  # nothing was there, or all that was is noise
             break
         dr.backward(losses.normal_variation(mesh.vertex_normals(), mesh.faces))

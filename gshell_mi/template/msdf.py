@@ -21,6 +21,9 @@ _CLEANINGS = 4
 #: Share of a piece of the template that is more than a speck on it: about one of its two sides.
 _SIDE = 0.25
 
+#: Lambda that smooths new rims along the template.
+_RIMS = 3.0
+
 #: Share of newly open vertices around a vertex from which on its value is new.
 _NEAR = 0.01
 
@@ -53,6 +56,11 @@ def clean_opacity(logits: np.ndarray, vertices: np.ndarray, faces: np.ndarray, m
         flip = small & (solid == flip_closed)
         cleaned[flip] = -cleaned[flip]
     return cleaned
+
+
+def rim_diffusion(faces: np.ndarray, vertex_count: int) -> MeshDiffusion:
+    """What smooths new rims of a template with (F, 3) faces."""
+    return MeshDiffusion(faces, vertex_count, _RIMS)
 
 
 def reopened(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
@@ -48,7 +49,7 @@ def cast(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Face, barycentric weights (0 without a hit) and distance (infinite then) of rays on a mesh."""
     o, d = (np.ascontiguousarray(x.T, np.float32) for x in (origins, directions))
-    ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d), reach, 0, [])
+    ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d), dr.opaque(mi.Float, reach), 0, [])
     hit = mesh_scene(vertices, faces).ray_intersect_preliminary(ray, coherent=False)
     valid, uv = hit.is_valid().numpy(), hit.prim_uv.numpy().T
     weights = np.where(valid[:, None], np.column_stack([1 - uv.sum(axis=1), uv]), 0)

@@ -14,9 +14,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields.smoothing import MeshDiffusion
-from ..topology import Topology, mesh_edges, patch_sizes, topology, vertex_components
+from ..topology import Topology, mesh_edges, patch_sizes, spread, topology, vertex_components
 from ..triangles import positive_part
-from .msdf import clean_opacity, reopened
+from .msdf import clean_opacity, reopened, rim_diffusion
 from .sides import normals_at_vertices, opposite_sides
 from .small_sheets import small_sheets
 
@@ -34,9 +34,6 @@ _CUT_OFF = 0.1
 
 #: Where there is no opening, a part is a sheet only if one side of it is this fraction of it.
 _SHEET_SHARE = 0.35
-
-#: Lambda that smooths the new rims along the mesh, and how redundant sides are carried along.
-_SMOOTHING = 3.0
 
 #: Size, at least, of the logits of both sides where one stays.
 _LEAST = 0.2
@@ -81,7 +78,7 @@ def collapsed_sheets(
     """
     solid = cut.logits > 0
     thickness, opposite = opposite_sides(before, cut.positions, faces, cell)
-    normals, smooth = normals_at_vertices(before, faces), MeshDiffusion(faces, len(solid), _SMOOTHING)
+    normals, smooth = normals_at_vertices(before, faces), rim_diffusion(faces, len(solid))
     redundant, sheets = redundant_sides(
         thickness, opposite, normals, faces, solid, smooth, cell, sheet_thickness
     )
@@ -177,7 +174,7 @@ def _grown(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges: np
     sources = [patch == index for index in np.argsort(-sizes) if sizes[index] > _SMALL * sizes.max()]
     for source in (*sources, opened):
         while True:
-            front = _beside(source, edges) & thin & ~opened & ~opened[opposite] & ~needed
+            front = spread(source, edges) & thin & ~opened & ~opened[opposite] & ~needed
             # Of two sides that are reached at once one stays.
             front &= ~(front[opposite] & (opposite < np.arange(len(opened))))
             if not front.any():
@@ -185,7 +182,7 @@ def _grown(opened: np.ndarray, thin: np.ndarray, opposite: np.ndarray, edges: np
             source, opened = source | front, opened | front
             needed[opposite[front]] = True
     # Where a sheet ends its sides meet in a ridge, which has no other side.
-    return opened | _beside(opened & ~start, edges) & ~needed & ~(thin & opened[opposite])
+    return opened | spread(opened & ~start, edges) & ~needed & ~(thin & opened[opposite])
 
 
 def _cut_off(opened: np.ndarray, solid: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -203,7 +200,7 @@ def _balanced(
     signs = np.where(opened, -1.0, 1.0)
     free = thin
     for _ in range(_RIDGE):
-        free = free | _beside(free, edges)
+        free = spread(free, edges)
     result = signs
     for _ in range(_BALANCINGS):
         result = smooth(mi.Float(result.astype(np.float32))).numpy()
@@ -229,13 +226,5 @@ def carried(
     movement = np.where(redundant[:, None], moved[opposite] - before[opposite], moved - before)
     movement[~known] = 0
     columns = [smooth(mi.Float(column.astype(np.float32))).numpy() for column in (known, *movement.T)]
-    spread = np.stack(columns[1:], axis=1) / np.maximum(columns[0], 1e-6)[:, None]
-    return np.where(redundant[:, None], before + spread, moved)
-
-
-def _beside(chosen: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """(V,) whether a vertex is none of the chosen (V,) but has one as a neighbour."""
-    result = np.zeros(len(chosen), bool)
-    for here, there in (edges.T, edges[:, ::-1].T):
-        result[here[chosen[there]]] = True
-    return result & ~chosen
+    mean = np.stack(columns[1:], axis=1) / np.maximum(columns[0], 1e-6)[:, None]
+    return np.where(redundant[:, None], before + mean, moved)

@@ -6,18 +6,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..fields import LatticeFields
-from ..fields.smoothing import MeshDiffusion
 from ..topology import equal_patches
 from ..triangles import area_vectors, unit, vertex_areas
 from ..views import PinholeViews
 from ..visibility import best_view
-from .msdf import reopened, rewritten
+from .msdf import reopened, rewritten, rim_diffusion
 
 #: What is seen at this cosine or less is as good as unseen: a hull ends in surfaces that views only graze.
 _GRAZING = 0.2
-
-#: Lambda that smooths the new rims along the template.
-_SMOOTHING = 3.0
 
 
 def without_unseen(
@@ -45,6 +41,6 @@ def without_unseen(
     unseen = hidden & (np.bincount(patch, area)[patch] > min_area * area.sum())
     if not unseen.any():
         return None
-    smooth = MeshDiffusion(cells, len(places), _SMOOTHING)
+    smooth = rim_diffusion(cells, len(places))
     cut, near = reopened(values, (values <= 0) | unseen, smooth, lattice.spacing)
     return rewritten(msdf, cut, near, template, lattice)

@@ -125,6 +125,26 @@ def test_material_is_carried_to_a_finer_lattice(fit):
     np.testing.assert_allclose(found[near], expected[near], atol=1e-3)
 
 
+def test_material_finds_its_place_in_blocks_that_have_moved(fit):
+    """A fit that goes on may have other blocks than its stage was given."""
+    first, second = (
+        BlockLattice.around(LATTICE, lambda p, r=radius: dr.norm(p) - r, mi.Float) for radius in (0.6, 0.65)
+    )
+    points = first.points(mi.Float).numpy().T
+    fields = LatticeFields.closed(np.linalg.norm(points, axis=1) - 0.6, LATTICE.grid)
+    fields = replace(fields, blocks=first.blocks.numpy(), block_resolution=LATTICE.resolution)
+    model = MaterialField(0.5 + 0.2 * points).parameters
+    surface = Surface(fields, model={name: values.numpy() for name, values in model.items()})
+    found = start_material(fit, surface, second, CONFIG).values()["vertex_color"].numpy().reshape(-1, 3)
+    where = second.points(mi.Float).numpy().T
+    both = np.isin(
+        second.lattice_vertex(dr.arange(mi.UInt32, second.vertex_count)).numpy(),
+        first.lattice_vertex(dr.arange(mi.UInt32, first.vertex_count)).numpy(),
+    )
+    assert 1000 < both.sum() < len(both)
+    np.testing.assert_allclose(found[both], 0.5 + 0.2 * where[both], atol=1e-3)
+
+
 def test_a_fit_in_blocks_is_resumed(bowl_scene, tmp_path, monkeypatch):
     output = tmp_path / "out"
     command = [

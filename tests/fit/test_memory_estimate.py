@@ -32,6 +32,16 @@ def test_targets_grow_with_pixels_and_the_lattice_with_cells():
     assert MemoryEstimate.of(FitConfig(), 64, mixed).samples == one.samples * 120000 // 256**2
 
 
+def test_what_does_not_run_takes_nothing():
+    config = FitConfig().changed({"cavities.batch": 10**9, "volume.batch": 10**9, "cameras.places": 10**9})
+    off = {"cavities.iterations": 0, "volume.iterations": 0, "poses": "keep"}
+    least = MemoryEstimate.of(FitConfig().changed(off), 64, SIZES).rays
+    for name in off:
+        but_one = {other: given for other, given in off.items() if other != name}
+        assert MemoryEstimate.of(config.changed(but_one), 64, SIZES).rays > 100 * least
+    assert MemoryEstimate.of(config.changed(off), 64, SIZES).rays == least
+
+
 @pytest.mark.parametrize(
     ("config", "resolution", "sizes", "cure"),
     [

@@ -30,7 +30,7 @@ def fingerprint(scene: FitScene, lattice: Lattice) -> dict[str, Any]:
 
     Args:
         scene: with its targets.
-        lattice: that the fit ends on.
+        lattice: that a fit from the hull ends on.
     """
     subject = scene.subject
     others = [shape for shape in scene.scene.shapes() if shape is not subject]
@@ -52,8 +52,8 @@ def fingerprint(scene: FitScene, lattice: Lattice) -> dict[str, Any]:
 
 def _arrays(target: Target) -> list[np.ndarray]:
     """What a target tells; that all of it is known, or no depths, adds nothing."""
-    known = np.asarray(target.known)
-    return [target.rgba] + ([] if target.depth is None else [target.depth]) + ([] if known.all() else [known])
+    depth = [] if target.depth is None else [target.depth]
+    return [target.rgba, *depth, *([] if target.is_known else [np.asarray(target.known)])]
 
 
 def check_fingerprint(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Carving: the template is hollowed out where that explains views better that nothing was fitted to."""
+"""Carving: the template is hollowed out where that explains unseen views better."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SEEING = 2
 
 
 def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
-    """Hollows out a template as far as held-out views are explained better.
+    """Hollows out a template as far as unseen views are explained better.
 
     Args:
         fit: the views.

@@ -39,7 +39,7 @@ _BEHIND, _SHALLOW = 1.5, 4.0
 
 
 def hollowed_vessels(fit: Fit, surface: Surface) -> Surface | None:
-    """Hollows a template out behind openings where that explains held-out views much better.
+    """Hollows a template out behind openings where that explains unseen views much better.
 
     Args:
         fit: the views.

@@ -20,7 +20,7 @@ from ...compat import write_mesh
 from ...images import decibels
 from ...material import principled
 from ...pixels import COVERED
-from ...targets import Target
+from ...targets import Target, mean_radiance
 from ...views import PinholeViews
 from ..bookkeeping.observer import Preview
 
@@ -112,8 +112,7 @@ class BackProjection:
         self._parameters = mi.traverse(self._scene)
         self._color = next(name for name in self._parameters.keys() if name.endswith("subject.vertex_color"))
         self._integrator = mi.load_dict({"type": "path", "max_depth": _DEPTH, "hide_emitters": True})
-        covered = [target.rgba[target.rgba[..., 3] > COVERED][:, :3] for target in targets]
-        self._dark = _DARK * float(np.concatenate(covered).mean())
+        self._dark = _DARK * mean_radiance(targets)
         count = len(mesh.vertices)
         self._logits = mi.Float(kept["logits"]) if kept else mi.Float(_logit(mesh.color).ravel())
         #: Over the pixels that see a vertex: of images and of renders, both over the images.

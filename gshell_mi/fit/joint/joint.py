@@ -53,6 +53,7 @@ class JointStage:
         light: None keeps the scene's.
         config: what all stages know.
         stage: settings of the stage; default: those of the joint stage.
+        name: of the stage.
         iterations: its steps; default: those of the joint stage.
         turns: (N, 3, 3) how the light has turned in each view; None if it stays.
     """
@@ -65,11 +66,12 @@ class JointStage:
         config: FitConfig,
         *,
         stage: JointConfig | None = None,
+        name: str = "joint",
         iterations: int | None = None,
         turns: np.ndarray | None = None,
     ):
         self.given, self.material, self.light, self.config = given, material, light, config
-        self.stage = stage or config.joint
+        self.stage, self.name = stage or config.joint, name
         self.iterations = config.iterations if iterations is None else iterations
         self.subject = given.subject
         self.subject.set_bsdf(mi.load_dict(principled()))
@@ -79,10 +81,13 @@ class JointStage:
         self.parameters = mi.traverse(self.scene)
         self._turns = turns if light else None
         #: Per view the share of each pixel that is known, None if that is all. The rest is black in images.
-        known = [np.asarray(target.known)[..., None] for target in given.targets]
-        self._known = [None if share.all() else mi.TensorXf(share) for share in known]
+        known = [
+            None if target.is_known else mi.TensorXf(np.asarray(target.known)[..., None])
+            for target in given.targets
+        ]
+        self._known = known
         self._targets = [
-            mi.TensorXf(target.rgba if share.all() else target.rgba * share)
+            mi.TensorXf(target.rgba) if share is None else mi.TensorXf(target.rgba) * share
             for target, share in zip(given.targets, known, strict=True)
         ]
         self._sees_masks = all(target.has_alpha for target in given.targets) and not config.geometry_only
@@ -271,8 +276,8 @@ class JointStage:
         self.parameters.update()
         if self.subject.surface.is_empty:
             raise UserError(
-                "The joint stage has left no surface; start again with --overwrite and a smaller "
-                "--joint.geometry-lr."
+                f"The {self.name} stage has left no surface; start again with --overwrite and a smaller "
+                f"--{self.name}.geometry-lr."
             )
 
     def _follow_surface(self, *, rescan: bool) -> None:
@@ -322,7 +327,4 @@ def other_objects(given: FitScene, light: EnvironmentLight | None) -> dict:
     for index, shape in enumerate(given.scene.shapes()):
         if shape is not given.subject:
             objects[f"shape_{index}"] = shape
-    for index, emitter in enumerate(given.scene.emitters()):
-        if emitter.id() != "light" and not emitter.is_environment() and not emitter.shape():
-            objects[f"emitter_{index}"] = emitter
     return objects

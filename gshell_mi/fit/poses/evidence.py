@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from ...compat import mesh_scene
 from ...pixels import COVERED, DARK
-from ...targets import Target
+from ...targets import Target, mean_radiance
 from ...triangles import unit
 from ...views import PinholeViews
 from ...visibility import GRAZING, hidden
@@ -77,12 +77,7 @@ class Texture:
         weights = trimesh.triangles.points_to_barycentric(surface.triangles[face], self.points)
         self._normals = unit(np.einsum("ij,ijk->ik", weights, surface.vertex_normals[faces[face]]))
         self._scene, self._cell, self._targets = mesh_scene(vertices, faces), cell, targets
-        means = [
-            float(target.rgba[..., :3][target.rgba[..., 3] > COVERED].mean())
-            for target in targets
-            if (target.rgba[..., 3] > COVERED).any()
-        ]
-        self._dark = DARK * float(np.mean(means or [1.0]))
+        self._dark = DARK * mean_radiance(targets)
 
     def level(self, blur: float, views: PinholeViews) -> Callable[[PinholeViews], list[Evidence]]:
         """Evidence in images that are blurred by so many pixels; what is hidden is told for given views."""

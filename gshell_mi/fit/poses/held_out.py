@@ -29,7 +29,7 @@ def held_out_views(fit: Fit, surface: Surface) -> list[View]:
         The views in their order, with the same targets.
     """
     held_out, count = fit.scene.held_out, len(fit.scene.sensors)
-    mesh, config = fit.scene.subject.surface_of(surface.fields).to_numpy()[:2], fit.config.cameras
+    mesh, config = fit.mesh(surface), fit.config.cameras
     if surface.poses is None or not held_out or not len(mesh[1]):
         return []
     sensors = [view.sensor for view in held_out]

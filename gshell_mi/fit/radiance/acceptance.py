@@ -9,15 +9,15 @@ import numpy as np
 
 from ...fields.smoothing import MeshDiffusion
 from ...template.caps import Recesses
-from ...topology import equal_patches, lobes, patch_sizes, vertex_components
+from ...topology import equal_patches, lobes, mesh_components, patch_sizes
 from ..judge import Judge, places_of
 from .shown import Part, Shown
 
 #: Rounds in which openings are closed; in the last one all that are rejected.
-CLOSINGS = 7
+_CLOSINGS = 7
 
-#: Openings that are this near to the worst close together.
-WORST = 0.5
+#: Places whose loss is this fraction of the largest are taken back together.
+_WORST = 0.5
 
 #: Lambda that smooths what single vertices tell along the mesh: a vertex is met by some hundred rays.
 _SMOOTHING = 10.0
@@ -54,7 +54,7 @@ def close_rejected(
         # Nothing at all explains no image.
         return np.where(given, logits, -logits)
     kept, trimmed, closed = opened, np.zeros_like(opened), 0
-    for closing in reversed(range(CLOSINGS)):
+    for closing in reversed(range(_CLOSINGS)):
         place = places_of(kept, lobes(kept, faces))
         after = template.part(np.where(kept | given, -np.abs(logits), np.abs(logits)))
         verdict = replace(judge.compare(before, after, place), rejected=closed)
@@ -62,7 +62,7 @@ def close_rejected(
         # The worst first; all where none is worse but some are not surely better, and in the last round.
         if closing:
             loss = np.where(worst, np.maximum(-verdict.gain, 0), 0)
-            worst &= loss >= WORST * loss.max()
+            worst &= worst_of(loss) if loss.any() else True
         rejected = kept & worst[place]
         if not rejected.any():
             break
@@ -80,6 +80,15 @@ def close_rejected(
         if not kept.any():
             break
     return np.where(opened & ~kept, -logits, logits)
+
+
+def worst_of(loss: np.ndarray) -> np.ndarray:
+    """(P,) which places to take back first, of what each loses: what is seen through one changes the others.
+
+    >>> worst_of(np.array([0.1, 1.0, 0.6])).tolist(), worst_of(np.array([-0.1, 0.0])).tolist()
+    ([False, True, True], [False, False])
+    """
+    return (loss > 0) & (loss >= _WORST * loss.max())
 
 
 def close_shallow(logits: np.ndarray, template: Shown, judge: Judge, thickness: float) -> np.ndarray:
@@ -114,7 +123,7 @@ def islands(solid: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     [True, False, False, False]
     """
     patch = equal_patches(solid, faces)
-    piece = vertex_components(faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(solid))[1]
+    piece = mesh_components(faces, len(solid))
     size, largest = patch_sizes(patch, piece, solid)
     return solid & (size < largest), patch
 

@@ -82,7 +82,7 @@ def trace_layers(
         offset: between a layer and where its ray goes on, world units.
         goes_on: of a layer, which of its rays pass it; None for all.
     """
-    layers = []
+    layers, behind = [], dr.opaque(mi.Float, offset)
     origin, direction, active = ray.o, ray.d, mi.Bool(True)
     for _ in range(count):
         hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
@@ -97,6 +97,6 @@ def trace_layers(
         layer = Layer(lane, origin, direction, face, mi.Vector3f(1 - uv.x - uv.y, uv.x, uv.y), front)
         layers.append(layer)
         active = goes_on(layer) if goes_on else mi.Bool(True)
-        origin = mi.Point3f(origin + direction * (t + offset))
+        origin = mi.Point3f(origin + direction * (t + behind))
         dr.eval(layer, origin, direction, active)
     return layers

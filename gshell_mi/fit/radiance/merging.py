@@ -21,7 +21,7 @@ from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import closed_template, lattice_index
 from .shown import Mesh
-from .volume_surface import without_specks
+from .volume_surface import without_floaters
 
 #: Cells by which a place has to be inside of one surface and outside of the other: what is less deep, the
 #: joint stage finds, and the lattice draws thin things thicker than they are.
@@ -74,8 +74,8 @@ def merged(fit: Fit, surface: Surface, other: Surface) -> Merged:
     fields = transfer_msdf(subject, surface.fields, fields)
     places = _Places.between(fields, other.fields)
     closed = _as_fine(subject.surface_of(surface.fields, template=True).to_numpy()[:2], length)
-    now = fit.judge.shown(_as_fine(subject.surface_of(surface.fields).to_numpy()[:2], length))
-    then = fit.judge.shown(subject.surface_of(other.fields).to_numpy()[:2])
+    now = fit.judge.shown(_as_fine(fit.mesh(surface), length))
+    then = fit.judge.shown(fit.mesh(other))
     verdict = fit.judge.compare(
         now.whole,
         then.whole,
@@ -149,7 +149,7 @@ def _with_places(fields: LatticeFields, other: LatticeFields, share: np.ndarray)
     """
     spacing = fields.lattice.spacing
     sdf = (1 - share) * fields.sdf + share * other.sdf
-    cells = without_specks((sdf / spacing).reshape((fields.lattice.stride,) * 3), 0.0)
+    cells = without_floaters((sdf / spacing).reshape((fields.lattice.stride,) * 3))
     return replace(
         fields,
         sdf=np.where(share > 0, spacing * cells.ravel(), sdf).astype(np.float32),

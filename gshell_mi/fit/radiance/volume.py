@@ -8,7 +8,7 @@ leaves. A fog has no such start: it thins wherever the views disagree and thicke
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -164,13 +164,14 @@ class RadianceVolume:
 
     # --- what it holds
 
-    def depth(self, view: int) -> np.ndarray:
-        """(height, width) distance along the ray through each pixel's centre, in world units, at which half
-        of the light is blocked; infinite where less ever is."""
-        width, height = (int(side) for side in self.views.sizes[view])
-        ray = self.views.pixel_rays(view)
-        found = depth_along(self.bricks, self._packets(), Rays.through(self.bricks, self.to_lattice @ ray))
-        return (found / dr.norm(self.to_lattice @ ray.d)).numpy().reshape(height, width)
+    def depths(self) -> Iterator[np.ndarray]:
+        """Of each view (height, width) distance along the ray through each pixel's centre, in world units, at
+        which half of the light is blocked; infinite where less ever is."""
+        packets = self._packets()
+        for view, (width, height) in enumerate(self.views.sizes):
+            ray = self.views.pixel_rays(view)
+            found = depth_along(self.bricks, packets, Rays.through(self.bricks, self.to_lattice @ ray))
+            yield (found / dr.norm(self.to_lattice @ ray.d)).numpy().reshape(height, width)
 
     def radiance_at(self, points: np.ndarray) -> np.ndarray:
         """(V, 3) radiance at (V, 3) world positions, averaged over directions; 0 where nothing is."""

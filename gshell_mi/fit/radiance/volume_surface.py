@@ -72,8 +72,7 @@ def volume_surface(
     alphas = [target.most_alpha for target in scene.targets]
     distance = visual_hull(points, masks).numpy()
     depths = []
-    for index, (target, alpha) in enumerate(zip(scene.targets, alphas, strict=True)):
-        depth = volume.depth(index)
+    for target, alpha, depth in zip(scene.targets, alphas, volume.depths(), strict=True):
         unknown = np.where(np.isfinite(depth), depth, np.nan) if target.has_alpha else depth
         depths.append(np.where(alpha < _COVERED, np.inf, unknown))
         progress()
@@ -84,7 +83,7 @@ def volume_surface(
     distance[near] = np.maximum(distance[near], inside.numpy())
     sdf = closed_at_border(lattice.spacing * (distance / cell - margin), lattice)
     cells = denoised(sdf, lattice, _ERROR) / lattice.spacing
-    cells = without_specks(cells.reshape((lattice.stride,) * 3), 0.0).ravel()
+    cells = without_floaters(cells.reshape((lattice.stride,) * 3)).ravel()
     sdf = closed_at_border(lattice.spacing * cells, lattice)
     if not (sdf < 0).any():
         return None
@@ -95,15 +94,15 @@ def volume_surface(
     return Surface(LatticeFields.closed(sdf, lattice.grid), seen=seen)
 
 
-def without_specks(distance: np.ndarray, level: float) -> np.ndarray:
-    """Distances without the small floaters below a level, and without air that nothing leads to."""
+def without_floaters(distance: np.ndarray) -> np.ndarray:
+    """Distances, in cells, without what is small and floats, and without air that nothing leads to."""
     everywhere = np.ones((3, 3, 3))
-    label, _ = ndimage.label(distance < level, everywhere)
+    label, _ = ndimage.label(distance < 0, everywhere)
     size = np.bincount(label.ravel())
     small = (label > 0) & (size[label] < 4 / 3 * np.pi * _FLOATER**3)
-    distance = np.where(small, level + 0.5, distance)
-    label, count = ndimage.label(distance >= level)
+    distance = np.where(small, 0.5, distance)
+    label, count = ndimage.label(distance >= 0)
     if not count:
         return distance
     outer = np.argmax(np.bincount(label.ravel())[1:]) + 1
-    return np.where((label > 0) & (label != outer), level - 0.5, distance)
+    return np.where((label > 0) & (label != outer), -0.5, distance)

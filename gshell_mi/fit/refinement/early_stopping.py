@@ -18,12 +18,12 @@ class EarlyStopping:
     Args:
         worker: does the steps, and logs ``image``.
         count: of its steps.
-        gain: the fraction of the first loss that the later one must stay below.
+        descent: the fraction of the first loss that the later one must stay below.
         state: has the ``descent`` so far, (2,) sums of losses at first and later, where the worker goes on.
     """
 
-    def __init__(self, worker: Work, count: int, gain: float, state: Mapping[str, np.ndarray]):
-        self.worker, self.gain = worker, gain
+    def __init__(self, worker: Work, count: int, descent: float, state: Mapping[str, np.ndarray]):
+        self.worker, self.descent = worker, descent
         self._judged = -(-count // 4)
         self._width = -(-self._judged // 8)
         self._sums = np.array(state.get("descent", np.zeros(2)))
@@ -47,4 +47,4 @@ class EarlyStopping:
 
     def stalled(self, done: int) -> bool:
         """Whether the steps are not worth going on with after ``done`` of them."""
-        return done >= self._judged and bool(self._sums[1] >= self.gain * self._sums[0])
+        return done >= self._judged and bool(self._sums[1] >= self.descent * self._sums[0])

@@ -67,7 +67,7 @@ class Cavities:
 def volume_inside(
     surface: Surface, fit: Fit, config: TrainingConfig, kept: Mapping[str, np.ndarray]
 ) -> RadianceVolume:
-    """A radiance volume inside a surface's hull, as fine as its lattice, of the training views.
+    """A radiance volume inside a surface's hull, as fine as its lattice.
 
     Args:
         surface: with its hull, on a lattice whose vertices make a cube.
@@ -92,7 +92,7 @@ def volume_inside(
         hull,
         subject.to_world,
         fit.views,
-        fit.training,
+        fit.pixels,
         config,
         sides,
         (vertices, faces),

@@ -21,7 +21,7 @@ from ..surface import Surface
 
 @dataclass(frozen=True)
 class GainsConfig:
-    """Exposure and white balance of the views."""
+    """Exposure and white balance of the views, and what the light is fixed to."""
 
     places: Annotated[int, Between(1)] = 2048
     """Vertices, at most, whose colours in different views are compared."""
@@ -44,7 +44,7 @@ class Exposures:
         """The surface with the gains of the views, or with none if they do not count."""
         config, scene = fit.config, fit.scene
         with steps.task():
-            mesh = scene.subject.surface_of(surface.fields).to_numpy()[:2]
+            mesh = fit.mesh(surface)
             seen = observe(
                 mesh,
                 fit.views,

@@ -113,6 +113,7 @@ class Joint:
             start_light(fit.scene, surface, config),
             config,
             stage=self.config,
+            name=self.name,
             iterations=self.iterations,
             turns=fit.views.turns,
         )
@@ -203,12 +204,13 @@ def _resampled_material(surface: Surface, lattice: Lattice | BlockLattice) -> Ma
     material = MaterialField(np.full((lattice.vertex_count, 3), TYPICAL_REFLECTANCE))
     material.parameters = {name: mi.Float(surface.model[name]) for name in material.parameters}
     before = surface.on_grid(lattice.grid).lattice
-    blocks = isinstance(before, BlockLattice)
-    if blocks and before.resolution == lattice.resolution:
-        return material
     for name in material.on_lattice:
         given = material.parameters[name]
-        whole = (before.spread_out(given), before.lattice) if blocks else (given, before)
+        if isinstance(before, BlockLattice):
+            whole = before.spread_out(given), before.lattice
+        else:
+            whole = given, before
+        # Blocks of the same lattice may be others: they have followed the surface before a fit was stopped.
         material.parameters[name] = Interpolation(*whole)(points)
     return material
 

@@ -37,7 +37,7 @@ class LightFrame:
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface with what the light is fixed to."""
         with steps.task():
-            mesh = fit.scene.subject.surface_of(surface.fields).to_numpy()[:2]
+            mesh = fit.mesh(surface)
             seen = observe(
                 mesh,
                 fit.views,

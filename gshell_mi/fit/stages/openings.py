@@ -107,7 +107,7 @@ class Openings:
                     lambda again: steps.repeat(training, count, again * count),
                 )
             opened = logits <= 0
-            appearance.refit(~opened)
+            (appearance.refit_anew if fit.config.watertight else appearance.refit)(~opened)
         front, _ = appearance.radiance()
         msdf = msdf_from_template(logits, template.mesh, surface.lattice)
         seen = Seen.on(surface.lattice, template.mesh, front, Seen.even_light(front[~opened]))

@@ -38,7 +38,7 @@ class Poses:
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface with corrections of the cameras, or as it was if they do not count."""
-        config, mesh = self.config, fit.scene.subject.surface_of(surface.fields).to_numpy()[:2]
+        config, mesh = self.config, fit.mesh(surface)
         if not (fit.pixels.has_alpha and len(mesh[1])):
             return surface
         with steps.task("verdict"):

@@ -1,7 +1,8 @@
 """Refinement and folds: the template's vertices move to where one radiance explains all images.
 
 The first round moves whole parts calmly; the second, "folds", hollows out pleats. Each is judged by views
-that it does not see: it does not count unless one radiance explains them the better for it.
+whose colours it does not see: it does not count unless one radiance explains them the better for it. Outlines
+of all views count.
 """
 
 from __future__ import annotations
@@ -90,7 +91,8 @@ class Refinement:
             meshes = [positive_part(at, template.faces, template.logits) for at in (start, after.positions)]
             verdict, unseen = (judge.decide(*meshes) for judge in (fit.judge, fit.validation_judge))
         steps.fact(f"{self.name}_verdict", verdict.facts() | {"unseen_gain": round(float(unseen.gain[0]), 5)})
-        # All views tell whether it is more than noise; those it was not fitted to, that it is no gloss.
+        # All views tell whether it is more than noise; those whose colours it does not know, that it is no
+        # gloss.
         accepted = verdict.accepted[0] and unseen.gain[0] > 0
         if self.first:
             return replace(surface, moved=(after,)) if accepted else surface

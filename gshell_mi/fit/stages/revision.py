@@ -16,15 +16,14 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...fields.smoothing import MeshDiffusion
 from ...template.caps import Recesses, least_bent
 from ...template.moved_parts import with_moved_parts
-from ...template.msdf import clean_opacity, reopened, rewritten
+from ...template.msdf import clean_opacity, reopened, rewritten, rim_diffusion
 from ...template.sides import opposite_sides
 from ...topology import inner, lobes
 from ...triangles import positive_part
 from ..judge import Judge, Verdict, places_of
-from ..radiance.acceptance import CLOSINGS, WORST, close_rejected, islands, open_rejected
+from ..radiance.acceptance import close_rejected, islands, open_rejected, worst_of
 from ..radiance.shown import Shown
 from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
@@ -36,9 +35,6 @@ from .openings import OpacityTraining, OpeningsConfig, justified
 #: Standard errors by which an opening has to explain more than a cap: half of what it takes to open one. A
 #: false slit below the chair's rail has from -2.0 to 3.7, from fit to fit; true openings have 1.9 to 13.
 _STANDING = 1.0
-
-#: Lambda that smooths new rims along the template.
-_SMOOTHING = 3.0
 
 
 class Revision:
@@ -90,7 +86,7 @@ class Revision:
         steps.fact("recessed_vertices", int((deeper & (revised > 0)).sum()))
         if not (changed | deeper).any():
             return surface
-        smooth = MeshDiffusion(faces, len(vertices), _SMOOTHING)
+        smooth = rim_diffusion(faces, len(vertices))
         cut, near = reopened(lattice.spacing * values, revised <= 0, smooth, lattice.spacing)
         msdf = rewritten(mi.Float(fields.msdf), cut, near, template, lattice).numpy()
         surface = replace(surface.with_fields(msdf=msdf), settled=False)
@@ -138,10 +134,7 @@ def _closed(judge: Judge, template: Shown, values: np.ndarray, opposite: np.ndar
         (V,) values, those of closed openings negated.
     """
     thin, faces = opposite >= 0, template.mesh[1]
-    for closing in reversed(range(CLOSINGS)):
-        chosen = values <= 0
-        if not chosen.any():
-            break
+    while (chosen := values <= 0).any():
         place = places_of(chosen, lobes(chosen, faces))
         backed = thin & (values[opposite] > 0)
         middle = np.where(inner(chosen, faces) & ~backed, place, -1)
@@ -149,8 +142,7 @@ def _closed(judge: Judge, template: Shown, values: np.ndarray, opposite: np.ndar
         gain = np.where(np.isfinite(verdict.noise), verdict.gain + _STANDING * verdict.noise, 0)
         if gain.max() <= 0:
             break
-        rejected = gain == gain.max() if closing else gain > 0
-        values = np.where(chosen & rejected[place], -values, values)
+        values = np.where(chosen & (place == gain.argmax()), -values, values)
     return values
 
 
@@ -161,10 +153,10 @@ def _with_islands(judge: Judge, template: Shown, values: np.ndarray, proposed: n
         place = places_of(chosen, lobes(chosen, template.mesh[1]))
         after = template.part(np.where(chosen, np.abs(values), values))
         verdict = judge.compare(template.part(values), after, place)
-        gain = np.where(verdict.accepted, verdict.gain, 0)
-        if not gain.any():
+        opaque = worst_of(np.where(verdict.accepted, verdict.gain, 0))
+        if not opaque.any():
             break
-        values = np.where(chosen & (gain >= WORST * gain.max())[place], -values, values)
+        values = np.where(chosen & opaque[place], -values, values)
     return values
 
 

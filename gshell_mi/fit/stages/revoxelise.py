@@ -75,8 +75,7 @@ def _taken(
 
 def compared(fit: Fit, before: Surface, after: Surface) -> Verdict:
     """How much better one surface explains unseen views than another."""
-    subject = fit.scene.subject
-    return fit.judge.decide(*(subject.surface_of(each.fields).to_numpy()[:2] for each in (before, after)))
+    return fit.judge.decide(fit.mesh(before), fit.mesh(after))
 
 
 def _made(

@@ -45,7 +45,8 @@ class Smoothing:
         with steps.task():
             before = _shown(fit, surface)
             for error in (self.config.most * fraction for fraction in _FRACTIONS):
-                other = surface.with_fields(sdf=denoised(fields.sdf, fields.lattice, error, fields.deform))
+                sdf = denoised(fields.sdf, fields.lattice, error, fields.deform, fields.weights)
+                other = surface.with_fields(sdf=sdf)
                 after = _shown(fit, other)
                 verdict = fit.judge.compare(before.whole, after.whole)
                 verdicts.append(verdict.facts())
@@ -58,7 +59,7 @@ class Smoothing:
 
 
 def _shown(fit: Fit, surface: Surface) -> Shown:
-    return fit.judge.shown(fit.scene.subject.surface_of(surface.fields).to_numpy()[:2])
+    return fit.judge.shown(fit.mesh(surface))
 
 
 def _without_specks(fit: Fit, surface: Surface) -> Surface:

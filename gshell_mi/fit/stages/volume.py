@@ -32,11 +32,11 @@ class Volume:
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface, or one with places of the volume's, on a lattice of its own. Lattices whose vertices
         make no cube have none."""
-        subject, lattice = fit.scene.subject, fit.lattices.volume
+        lattice = fit.lattices.volume
         if lattice.vertex_count != lattice.stride**3:
             return surface
-        before = subject.surface_of(surface.fields).to_numpy()[:2]
-        volume = self._volume(fit, before, steps.kept)
+        steps.fact("volume_kept", False)
+        volume = self._volume(fit, fit.mesh(surface), steps.kept)
         steps.run(volume, self.config.iterations, volume.optimizers, volume.arrays)
         with steps.task("depth", len(fit.views)) as advance:
             other = volume_surface(volume, fit.scene, fit.masks, lattice, surface.seen.light, advance)

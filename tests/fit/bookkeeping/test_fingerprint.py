@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,3 +58,12 @@ def test_it_says_what_differs(found, changes, words):
 def test_a_crafted_one_without_entries(found):
     with pytest.raises(UserError, match="lattice: None instead of tet"):
         check_fingerprint({}, found)
+
+
+def test_pixels_known_in_part_belong_to_it(bowl_scene, found):
+    scene = load_fit_scene(bowl_scene)
+    first, *others = scene.targets
+    first = replace(first, known=np.full(first.rgba.shape[:2], 0.3, np.float32))
+    other = fingerprint(replace(scene, targets=[first, *others]), TetLattice(20))
+    differ = [name for name, digest in other["targets"].items() if digest != found["targets"][name]]
+    assert differ == [scene.sensors[0].id()]

@@ -66,9 +66,8 @@ def test_it_learns_from_coarse_to_fine(trained):
 def test_its_depth_is_that_of_the_bowl(scene, trained):
     """Also inside, which no silhouette shows."""
     errors = []
-    for view in range(len(scene.sensors)):
-        ray = trained.views.pixel_rays(view)
-        depth = trained.depth(view).ravel()
+    for view, depth in enumerate(trained.depths()):
+        ray, depth = trained.views.pixel_rays(view), depth.ravel()
         points = np.array(ray.o).T + depth[:, None] * np.array(ray.d).T
         seen = np.isfinite(depth) & (scene.targets[view].rgba[..., 3].ravel() > 0.99)
         errors.append(np.abs(np.linalg.norm(points[seen], axis=1) - RADIUS))

@@ -17,8 +17,7 @@ def fit(gain: float) -> SimpleNamespace:
         assert (before, after) == (("start", "faces"), ("refined", "faces"))
         return Verdict(*(np.array([value]) for value in (1.0, 1.0, gain, 1.0)))
 
-    mesh = SimpleNamespace(surface_of=lambda name: SimpleNamespace(to_numpy=lambda: (name, "faces", None)))
-    return SimpleNamespace(judge=SimpleNamespace(decide=decide), scene=SimpleNamespace(subject=mesh))
+    return SimpleNamespace(judge=SimpleNamespace(decide=decide), mesh=lambda found: (found.fields, "faces"))
 
 
 def surface(name: str) -> SimpleNamespace:
