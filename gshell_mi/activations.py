@@ -29,7 +29,7 @@ def softplus(x: ArrayT) -> ArrayT:
 
 
 def inverse_softplus(y: float) -> float:
-    """The number whose softplus is ``y``, but at least 0.001.
+    """The number whose softplus is ``y``, where a smaller ``y`` counts as 0.001.
 
     >>> import mitsuba as mi
     >>> f"{softplus(mi.Float(inverse_softplus(0.3)))[0]:.4f}"

@@ -111,7 +111,7 @@ def _parsed(parse: Callable[[], Arguments], name: str) -> Arguments:
 
 def _sentence_of(box: str, name: str) -> str:
     """What is wrong and how to mend it, of a box that tyro prints."""
-    lines = [re.sub(r"[^\x20-\x7e]", "", line).strip() for line in box.splitlines()[1:-1]]
+    lines = [re.sub(r"[\u2500-\u257f]", "", line).strip() for line in box.splitlines()[1:-1]]
     wrong = " ".join(itertools.takewhile(bool, lines)).rstrip(".")
     helped = f"python -m gshell_mi.{name} --help lists all options"
     unknown = re.match(r"Unrecognized options: ([^,]+)", wrong)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import threading
 import time
@@ -19,6 +20,9 @@ except ImportError:  # Windows has none: nothing is locked there, and what a kil
 
 #: How the names of files begin that are being written.
 PARTIAL = ".partial."
+
+#: Such a name: as no user's file has one, it may be removed.
+_OURS = re.compile(re.escape(PARTIAL) + r"[0-9a-f]{12}(\..*)?")
 
 #: Seconds after which a partial file that nobody holds is a killed run's; it is locked once it is there.
 _JUST_MADE = 1.0
@@ -67,6 +71,8 @@ def replacing(path: Path) -> Iterator[Path]:
 def remove_stale(folder: Path) -> None:
     """Removes what killed runs were writing in a folder; what runs are writing now is left alone."""
     for path in folder.glob(f"{PARTIAL}*"):
+        if not _OURS.fullmatch(path.name):
+            continue
         try:
             handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
         except OSError:  # a link, or gone

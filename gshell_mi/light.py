@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from skimage.transform import resize
+from skimage.transform import resize_local_mean
 
 from .compat import environment_data, environment_radiance
 
@@ -28,6 +27,13 @@ def turns_with_camera(sensors: list[mi.Sensor]) -> np.ndarray:
     ]
     axes = [matrix / np.linalg.norm(matrix, axis=0) for matrix in axes]
     return np.array([matrix @ axes[0].T for matrix in axes])
+
+
+def turned(to_world: mi.ScalarTransform4f, turn: np.ndarray) -> mi.Transform4f:
+    """``to_world`` of an emitter where the light has turned, by a rotation (3, 3)."""
+    rotation = np.eye(4)
+    rotation[:3, :3] = turn
+    return mi.Transform4f(mi.ScalarTransform4f(rotation) @ to_world)
 
 
 class EnvironmentLight:
@@ -63,8 +69,9 @@ class EnvironmentLight:
         if "data" not in parameters:
             return None
         radiance = environment_radiance(emitter)
-        shrunk: Any = resize(
-            radiance, (height, 2 * height, 3), order=1, anti_aliasing=radiance.shape[0] > height
+        # A sun may be one texel, also at the map's seam: means over areas lose nothing of it.
+        shrunk = resize_local_mean(
+            radiance, (height, 2 * height), grid_mode=True, preserve_range=True, channel_axis=-1
         )
         return cls(shrunk, mi.ScalarTransform4f(np.array(parameters["to_world"].matrix).reshape(4, 4)))
 
@@ -74,9 +81,7 @@ class EnvironmentLight:
 
     def turned(self, turn: np.ndarray) -> mi.Transform4f:
         """``to_world`` of the emitter where the light has turned, by a rotation (3, 3)."""
-        rotation = np.eye(4)
-        rotation[:3, :3] = turn
-        return mi.Transform4f(mi.ScalarTransform4f(rotation) @ self._to_world)
+        return turned(self._to_world, turn)
 
     @cached_property
     def solid_angles(self) -> mi.TensorXf:

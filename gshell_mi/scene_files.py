@@ -105,7 +105,7 @@ def _check_document(path: Path, root: Path, defaults: dict[str, str], level: int
         if tag == "default" and "name" in attributes:
             defaults.setdefault(attributes["name"], attributes.get("value", ""))
         if tag == "include" and "filename" in attributes:
-            included.append(_substituted(attributes["filename"], defaults))
+            included.append(substituted(attributes["filename"], defaults))
 
     def ended(tag: str) -> None:
         nonlocal depth
@@ -115,14 +115,16 @@ def _check_document(path: Path, root: Path, defaults: dict[str, str], level: int
         _parse(path, started, ended)
     except expat.ExpatError as error:
         raise ValueError(f"'{path}' is no XML file ({error})") from error
-    if level < _MOST_INCLUDES:
-        for name in included:
-            found = next((folder / name for folder in (path.parent, root) if (folder / name).is_file()), None)
-            if found is not None:
-                _check_document(found, root, defaults, level + 1)
+    for name in included:
+        found = next((folder / name for folder in (path.parent, root) if (folder / name).is_file()), None)
+        if found is not None:
+            if level >= _MOST_INCLUDES:
+                raise ValueError(f"'{path}' is included {level} files deep; a file may not include itself")
+            _check_document(found, root, defaults, level + 1)
 
 
-def _substituted(text: str, defaults: dict[str, str]) -> str:
+def substituted(text: str, defaults: dict[str, str]) -> str:
+    """A value with what its ``$`` parameters stand for, as Mitsuba reads it: longer names first."""
     for name in sorted(defaults, key=len, reverse=True):
         text = text.replace("$" + name, defaults[name])
     return text

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from xml.etree import ElementTree
 
+from .scene_files import substituted
+
 #: Folders in which files are looked for, at most.
 _ROOTS = 16
-
-_PARAMETER = re.compile(r"\$(\w+)")
 
 
 def scene_inputs(path: Path) -> set[Path]:
@@ -33,14 +32,11 @@ def _gather(path: Path, roots: list[Path], parameters: dict[str, str], found: se
         node.get("name", ""): node.get("value", "") for node in document.iter("default")
     }
 
-    def resolved(value: str) -> str:
-        return _PARAMETER.sub(lambda match: parameters.get(match[1], match[0]), value)
-
-    folders = [resolved(node.get("value", "")) for node in document.iter("path")]
+    folders = [substituted(node.get("value", ""), parameters) for node in document.iter("path")]
     roots = (roots + [roots[0] / folder for folder in folders])[:_ROOTS]
     for node in document.iter():
         for value in node.attrib.values():
-            for file in {folder / resolved(value) for folder in (path.parent, *roots)}:
+            for file in {folder / substituted(value, parameters) for folder in (path.parent, *roots)}:
                 if _is_file(file) and file not in found:
                     found.add(file)
                     if node.tag == "include":

@@ -143,6 +143,22 @@ class PinholeViews:
         return mi.Float(np.linalg.norm(self.bases[:, :, 0], axis=1) / self.sizes[:, 0])
 
 
+#: Plugins of reconstruction filters by the names of their classes.
+_FILTERS = {
+    "BoxFilter": "box",
+    "GaussianFilter": "gaussian",
+    "TentFilter": "tent",
+    "MitchellNetravaliFilter": "mitchell",
+    "CatmullRomFilter": "catmullrom",
+    "LanczosSincFilter": "lanczos",
+}
+
+
+def filter_of(film: mi.Film) -> str:
+    """The plugin of a film's reconstruction filter."""
+    return _FILTERS.get(film.rfilter().class_name(), "gaussian")
+
+
 def kind_of(sensor: mi.Sensor) -> str:
     """The plugin of a sensor that ``PinholeViews`` takes: one of ``OPTICS``."""
     return "thinlens" if "aperture_radius" in mi.traverse(sensor) else "perspective"

@@ -71,6 +71,9 @@ def test_what_a_killed_run_was_writing_goes_and_what_a_run_is_writing_stays(tmp_
     old = partial.stat().st_mtime - 60
     os.utime(partial, (old, old))
     (tmp_path / "notes.txt").write_text("mine")
+    download = tmp_path / ".partial.my_download.zip"
+    download.write_text("mine too")
+    os.utime(download, (old, old))
     try:
         remove_stale(tmp_path)
         assert partial.exists()
@@ -78,7 +81,7 @@ def test_what_a_killed_run_was_writing_goes_and_what_a_run_is_writing_stays(tmp_
         process.kill()
         process.communicate()
     remove_stale(tmp_path)
-    assert names(tmp_path) == ["notes.txt"]
+    assert names(tmp_path) == [".partial.my_download.zip", "notes.txt"]
 
 
 def test_a_lock_goes_with_its_owner(tmp_path):

@@ -85,6 +85,16 @@ def test_from_an_emitter_of_another_size():
     np.testing.assert_allclose(radiance[1:-1, :, 0], expected[1:-1], rtol=0.01)
 
 
+@pytest.mark.parametrize("column", [0, 31, 64, 127])
+def test_a_small_sun_keeps_its_energy(column):
+    """Also at the seam."""
+    sky = np.full((64, 128, 3), 0.1, np.float32)
+    sky[20, column] = 1000
+    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(sky)})
+    light = EnvironmentLight.from_emitter(emitter, height=16)
+    assert np.array(light.radiance).mean() == pytest.approx(sky.mean(), rel=1e-3)
+
+
 def test_and_so_it_does_after_an_update(radiance, stock):
     scene = mi.load_dict({"type": "scene", "light": EnvironmentLight.uniform(6, 1.0).emitter()})
     parameters = mi.traverse(scene)

@@ -110,6 +110,12 @@ def test_nesting_that_would_overflow_mitsubas_stack(included, tmp_path):
         load_scene(deep)
 
 
+def test_a_file_that_includes_itself_is_refused(tmp_path):
+    looping = scene(tmp_path, 4 * '<include filename="scene.xml"/>')
+    with pytest.raises(UserError, match="a file may not include itself"):
+        load_scene(looping)
+
+
 def test_files_beside_the_scene_are_found(tmp_path):
     (tmp_path / "inside").mkdir()
     trimesh.creation.icosphere(1).export(tmp_path / "inside" / "ball.ply")

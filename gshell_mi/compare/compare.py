@@ -16,6 +16,7 @@ from ..export.fitted_scene import load_fitted_scene
 from ..files import name_trouble
 from ..images import over_white, write_png
 from ..json_files import read_json_object
+from ..light import turned, turns_with_camera
 from ..own_folder import TAG, check_own_file
 from ..scene_files import load_scene
 from ..targets import load_target
@@ -84,7 +85,10 @@ def compare_fit(
     """
     folder = Path(folder)
     scene = load_fitted_scene(folder, envmap)
-    targets = Path(targets) if targets else _recorded_targets(folder)
+    metrics = _metrics(folder)
+    # As a fit scores its own views: each target as it was exposed, and a light that turned where it was then.
+    exposed = {} if targets or sensors else _gains(metrics)
+    targets = Path(targets) if targets else _recorded_targets(folder, metrics)
     cameras = load_scene(sensors).sensors() if sensors else scene.sensors()
     if not cameras:
         raise UserError(f"'{sensors}' has no sensors; give a scene file with some.")
@@ -92,25 +96,36 @@ def compare_fit(
     width, height = np.max([camera.film().crop_size() for camera in cameras], axis=0)
     memory.require_for_image(int(width), int(height), spp, "A view", "lower --spp")
     references = [
-        load_target(targets / f"{camera.id()}.exr", *camera.film().crop_size()).rgba for camera in cameras
+        load_target(targets / f"{camera.id()}.exr", *camera.film().crop_size()) for camera in cameras
     ]
     surfaces = (read_mesh(folder / "mesh.ply"), read_mesh(mesh)) if mesh else None
     integrator = mi.load_dict({"type": "path", "max_depth": 5, "hide_emitters": True})
     images, views = [], {}
+    parameters = mi.traverse(scene)
+    lights = []
+    if metrics.get("light_frame") == "camera" and not envmap:
+        to_world = mi.ScalarTransform4f(np.array(parameters["light.to_world"].matrix).reshape(4, 4))
+        turns = turns_with_camera([scene.sensors()[0], *cameras])[1:]
+        lights = [turned(to_world, turn) for turn in turns]
     for number, (camera, reference) in enumerate(zip(cameras, references, strict=True)):
+        if lights:
+            parameters["light.to_world"] = lights[number]
+            parameters.update()
         image = np.array(mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=number))
         if image.shape[2] != 4:
             raise UserError(f"Sensor '{camera.id()}' has a film without alpha; set its pixel_format to rgba.")
-        images.append(image)
-        views[camera.id()] = _score(camera.id(), image, reference, errors)
+        image[..., :3] *= exposed.get(camera.id(), 1)
+        if envmap:
+            images.append(image)
+        views[camera.id()] = _score(camera.id(), image, reference.rgba, errors, np.asarray(reference.known))
         if progress:
             progress(number + 1, len(cameras))
     result = {"views": views, "mean": mean_scores(views.values())}
     if envmap:
-        scale = albedo_scale(images, references)
+        scale = albedo_scale(images, [reference.rgba for reference in references])
         factors = np.append(scale, 1.0)
         scaled = {
-            name: image_scores(image * factors, reference)[0]
+            name: image_scores(image * factors, reference.rgba, np.asarray(reference.known))[0]
             for name, image, reference in zip(views, images, references, strict=True)
         }
         result |= {"mean_albedo_scaled": mean_scores(scaled.values()), "albedo_scale": scale.tolist()}
@@ -119,14 +134,29 @@ def compare_fit(
     return result
 
 
-def _recorded_targets(folder: Path) -> Path:
+def _metrics(folder: Path) -> dict:
+    """What a fit has noted; nothing if it has not."""
     try:
-        return Path(read_json_object(folder / "metrics.json")["targets"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"'{folder / 'metrics.json'}' does not tell where the targets are; name their folder "
-            f"with --targets."
-        ) from error
+        return read_json_object(folder / "metrics.json")
+    except (OSError, ValueError):
+        return {}
+
+
+def _gains(metrics: dict) -> dict[str, np.ndarray]:
+    """What each view's channels are multiplied by; nothing if all were exposed alike."""
+    try:
+        gains = metrics["exposures"]["gains"].items()
+        return {name: np.array(gain, np.float32).reshape(3) for name, gain in gains}
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return {}
+
+
+def _recorded_targets(folder: Path, metrics: dict) -> Path:
+    if isinstance(targets := metrics.get("targets"), str):
+        return Path(targets)
+    raise UserError(
+        f"'{folder / 'metrics.json'}' does not tell where the targets are; name their folder with --targets."
+    )
 
 
 def _pairs(first: Path, second: Path) -> tuple[dict[str, tuple[Path, Path]], list[str]]:
@@ -139,7 +169,7 @@ def _pairs(first: Path, second: Path) -> tuple[dict[str, tuple[Path, Path]], lis
     if not first.is_dir():
         return {first.stem: (first, second)}, []
     ours, theirs = (
-        {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".exr"}
+        {path.stem: path for path in sorted(folder.iterdir()) if _is_image(path)}
         for folder in (first, second)
     )
     names = sorted(ours.keys() & theirs.keys())
@@ -149,9 +179,16 @@ def _pairs(first: Path, second: Path) -> tuple[dict[str, tuple[Path, Path]], lis
     return {name: (ours[name], theirs[name]) for name in names}, unmatched
 
 
-def _score(name: str, image: np.ndarray, reference: np.ndarray, errors: Path | None) -> Scores:
+def _is_image(path: Path) -> bool:
+    """Whether a file is an EXR image, and no map of what is known of one or of its depth."""
+    return path.suffix.lower() == ".exr" and Path(path.stem).suffix not in (".known", ".depth")
+
+
+def _score(
+    name: str, image: np.ndarray, reference: np.ndarray, errors: Path | None, known: np.ndarray | None = None
+) -> Scores:
     try:
-        scores, flip = image_scores(image, reference)
+        scores, flip = image_scores(image, reference, known)
     except UserError as error:
         raise UserError(f"'{name}': {error}") from error
     if errors:

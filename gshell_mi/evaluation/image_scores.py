@@ -54,9 +54,11 @@ def read_image(path: Path) -> np.ndarray:
     return load_target(path, *size).rgba
 
 
-def image_scores(image: np.ndarray, reference: np.ndarray) -> tuple[Scores, np.ndarray]:
+def image_scores(
+    image: np.ndarray, reference: np.ndarray, known: np.ndarray | None = None
+) -> tuple[Scores, np.ndarray]:
     """The scores ``IMAGE_SCORES`` of two (h, w, 4) linear premultiplied images, and the FLIP map: (h, w, 3)
-    in the colours of magma.
+    in the colours of magma. Where the (h, w) reference is not ``known``, nothing is held against the image.
 
     FLIP: Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", HPG 2020, at its default
     67 pixels per degree.
@@ -76,8 +78,9 @@ def image_scores(image: np.ndarray, reference: np.ndarray) -> tuple[Scores, np.n
         )
     if min(image.shape[:2]) < _SSIM_WINDOW:
         raise UserError(f"The images are {_size(image)} pixels; SSIM needs {_SSIM_WINDOW} at least per side.")
+    reference, counted = _as_known(image, reference, known)
     left, right = over_white(image), over_white(reference)
-    first, second = image[..., 3] > 0.5, reference[..., 3] > 0.5
+    first, second = (image[..., 3] > 0.5) & counted, (reference[..., 3] > 0.5) & counted
     scores, flip_map = _scores(left, right, first, second)
     union, squared = first | second, (image[..., :3] - reference[..., :3]) ** 2
     scores["relative_mse"] = float((squared / (reference[..., :3] ** 2 + _RELATIVE_FLOOR)).mean())
@@ -104,11 +107,20 @@ def view_scores(image: np.ndarray, target: Target) -> Scores:
     Where the target is not known, nothing is held against the image. ``mask_iou`` is None if the target came
     without alpha, and ``ssim`` of images below 7 pixels.
     """
-    known = np.asarray(target.known)[..., None]
-    left, right = over_white(image), over_white(known * target.rgba + (1 - known) * image)
-    counted = known[..., 0] > 0.5
-    scores, _ = _scores(left, right, (image[..., 3] > 0.5) & counted, (target.rgba[..., 3] > 0.5) & counted)
+    reference, counted = _as_known(image, target.rgba, np.asarray(target.known))
+    first, second = (image[..., 3] > 0.5) & counted, (reference[..., 3] > 0.5) & counted
+    scores, _ = _scores(over_white(image), over_white(reference), first, second)
     return scores if target.has_alpha else scores | {"mask_iou": None}
+
+
+def _as_known(
+    image: np.ndarray, reference: np.ndarray, known: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """A reference that is the image where it is unknown, and (h, w) which pixels of masks count."""
+    if known is None:
+        return reference, np.ones(reference.shape[:2], bool)
+    share = known[..., None]
+    return share * reference + (1 - share) * image, known > 0.5
 
 
 def _scores(

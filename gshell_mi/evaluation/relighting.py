@@ -16,6 +16,8 @@ def albedo_scale(images: list[np.ndarray], references: list[np.ndarray]) -> np.n
     >>> albedo_scale([image], [image * [2, 3, 4, 1]]).round(6).tolist()
     [2.0, 3.0, 4.0]
     """
-    image, reference = (np.stack(stack)[..., :3] for stack in (images, references))
-    axes = (0, 1, 2)
-    return (image * reference).sum(axes) / np.maximum((image**2).sum(axes), 1e-12)
+    products, squares = np.zeros(3), np.zeros(3)
+    for image, reference in zip(images, references, strict=True):
+        products += (image * reference)[..., :3].sum((0, 1))
+        squares += (image**2)[..., :3].sum((0, 1))
+    return products / np.maximum(squares, 1e-12)

@@ -20,7 +20,7 @@ _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 TRIANGLES, LINES = 4, 1
 
-#: glTF's sampler codes: linear with mip-maps, and repeating at the edges as nothing lies there.
+#: glTF's sampler codes: linear with mip-maps, and clamped at the edges.
 _SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
 
 

@@ -14,7 +14,7 @@ from ..compat import environment_radiance, write_bitmap
 from ..errors import UserError
 from ..files import replacing
 from ..material import ATTRIBUTES
-from ..views import OPTICS, kind_of
+from ..views import OPTICS, filter_of, kind_of
 
 if TYPE_CHECKING:
     from ..light import EnvironmentLight
@@ -59,6 +59,7 @@ _SENSOR = """\
             <integer name="crop_offset_x" value="{crop_x}"/>
             <integer name="crop_offset_y" value="{crop_y}"/>
             <string name="pixel_format" value="rgba"/>
+            <rfilter type="{rfilter}"/>
         </film>
     </sensor>"""
 
@@ -153,6 +154,7 @@ def _sensor(sensor: mi.Sensor) -> str:
         crop_height=crop_height,
         crop_x=crop_x,
         crop_y=crop_y,
+        rfilter=filter_of(film),
     )
 
 

@@ -89,16 +89,14 @@ def _flat(name: str, field: Field, count: int) -> Field:
 
 
 def _check_finite(fields: dict[str, Field]) -> None:
-    for name, field in fields.items():
-        if not _is_finite(field):
+    parts = {
+        name: list(dr.detach(field)) if dr.depth_v(field) == 2 else [dr.detach(field)]
+        for name, field in fields.items()
+    }
+    # A sum reads all fields once and is not finite if any value is not; should it have overflowed, look again
+    # value by value.
+    if dr.isfinite(sum(dr.sum(part) for each in parts.values() for part in each))[0]:
+        return
+    for name, each in parts.items():
+        if not all(dr.all(dr.isfinite(part))[0] for part in each):
             raise UserError(f"{name} holds NaN or infinite values")
-
-
-def _is_finite(*fields: Field) -> bool:
-    for field in fields:
-        for part in list(dr.detach(field)) if dr.depth_v(field) == 2 else [dr.detach(field)]:
-            # A sum reads the field once and is not finite if any value is not; should it have overflowed,
-            # look again value by value.
-            if not dr.isfinite(dr.sum(part))[0] and not dr.all(dr.isfinite(part))[0]:
-                return False
-    return True

@@ -124,8 +124,8 @@ class Stencil:
 class SurfaceMesh:
     """A triangle mesh extracted from lattice fields, differentiable in them.
 
-    The faces are oriented: anticlockwise seen from outside the template. Every vertex and every face is
-    used once; the mesh is an edge- and vertex-manifold whose boundary vertices have two boundary edges.
+    The faces are oriented: anticlockwise seen from outside the template. No vertex is unused, and no face is
+    there twice; the mesh is an edge- and vertex-manifold whose boundary vertices have two boundary edges.
     """
 
     vertices: Array3f

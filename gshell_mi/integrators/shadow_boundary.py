@@ -82,7 +82,8 @@ def boundary_terms(
         return
     samples = max(int(dr.prod(sensor.film().crop_size()) * integrator.light_edge_samples), 1)
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, 8)
+    # Not the numbers that the camera's first samples are of.
+    sampler.seed(mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(3))[0], 8)
 
     def shifts() -> mi.Float:
         x = sampler.next_1d()

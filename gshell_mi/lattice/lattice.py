@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import AnyArray, Array3f, Field, Float, UInt32
 from ..errors import UserError
 
-#: Cells per side; beyond, vertices could not be numbered.
+#: Cells per side; ``deform``, three numbers per vertex, ends at 2^32 values soon after.
 MOST_CELLS = 800
 
 #: Stands for a vertex that does not exist.

@@ -27,7 +27,7 @@ class StepRules:
     """The same of ``msdf`` with ``explicit``; falls a hundredfold, as what noise has done to a rim stays. The
     other kinds move it as ``sdf``."""
     deform_rate: float = 0.02
-    """The same of ``deform`` and ``weights``."""
+    """The same of ``deform``, in units of the greatest offset that is allowed, and of ``weights``."""
     smoothing: float = 8.0
     """Lambda of the Sobolev gradient on the lattice at the start; only where lattice values are optimised."""
     detail: float = 0.5

@@ -66,6 +66,61 @@ def test_files_and_folders(sphere, tmp_path):
     assert whole["mean"]["psnr"] == pytest.approx(np.mean([view["psnr"] for view in whole["views"].values()]))
 
 
+def test_maps_beside_targets_are_no_images(sphere, tmp_path):
+    both = [shutil.copytree(folder, tmp_path / folder.name) for folder in (sphere.targets, sphere.dim)]
+    for folder in both:
+        for kind in ("known", "depth"):
+            mi.Bitmap(np.ones((SIZE, SIZE, 1), np.float32)).write(str(folder / f"view_000.{kind}.exr"))
+    assert set(scores(*both, tmp_path=tmp_path)["views"]) == {"view_000", "view_001"}
+
+
+def test_what_is_unknown_of_a_target_is_not_held_against_the_fit(sphere, tmp_path):
+    targets = shutil.copytree(sphere.targets, tmp_path / "targets")
+    known = np.ones((SIZE, SIZE, 1), np.float32)
+    known[:, : SIZE // 2] = 0
+    for view in sphere.targets.iterdir():
+        pixels = np.array(mi.Bitmap(str(view)))
+        pixels[:, : SIZE // 2] = 0
+        mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGBA).write(str(targets / view.name))
+    spoilt = scores(sphere.folder, "--targets", targets, tmp_path=tmp_path)["mean"]
+    for view in sphere.targets.iterdir():
+        mi.Bitmap(known).write(str(targets / f"{view.stem}.known.exr"))
+    told = scores(sphere.folder, "--targets", targets, tmp_path=tmp_path)["mean"]
+    assert told["psnr"] > 30 > spoilt["psnr"] and told["mask_iou"] > 0.97 > 0.6 > spoilt["mask_iou"]
+
+
+def test_a_fit_is_exposed_as_its_targets_were(sphere, tmp_path):
+    folder = shutil.copytree(sphere.folder, tmp_path / "fit")
+    metrics = {"targets": str(sphere.dim)}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    assert scores(folder, tmp_path=tmp_path)["mean"]["psnr"] < 25
+    gains = {f"view_{number:03}": [0.5, 0.5, 0.5] for number in range(VIEWS)}
+    (folder / "metrics.json").write_text(json.dumps(metrics | {"exposures": {"gains": gains}}))
+    assert scores(folder, tmp_path=tmp_path)["mean"]["psnr"] > 30
+
+
+def test_a_light_that_turns_with_the_camera_turns(sphere, tmp_path):
+    """The first view is lit as before; of the second, lit so as the first is, the light has turned."""
+    folder = shutil.copytree(sphere.folder, tmp_path / "fit")
+    sky = np.full((8, 16, 3), 0.1, np.float32)
+    sky[:, :4] = 4
+    mi.Bitmap(sky).write(str(folder / "light.exr"))
+    targets = tmp_path / "targets"
+    targets.mkdir()
+    scene = mi.load_file(str(folder / "scene.xml"))
+    for sensor in scene.sensors():
+        mi.Bitmap(np.array(mi.render(scene, sensor=sensor, spp=64)), mi.Bitmap.PixelFormat.RGBA).write(
+            str(targets / f"{sensor.id()}.exr")
+        )
+    found = []
+    for frame in ("world", "camera"):
+        (folder / "metrics.json").write_text(json.dumps({"targets": str(targets), "light_frame": frame}))
+        views = scores(folder, tmp_path=tmp_path)["views"]
+        found.append([view["psnr"] for view in views.values()])
+    world, camera = found
+    assert camera[0] == pytest.approx(world[0], abs=0.5) and camera[1] < world[1] - 3
+
+
 def test_images_that_show_the_object_nowhere_alike(tmp_path, capsys):
     for name, half in (("a.exr", slice(8)), ("b.exr", slice(8, 16))):
         pixels = np.zeros((16, 16, 4), np.float32)

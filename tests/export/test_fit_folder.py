@@ -168,7 +168,7 @@ SENSORS = {
 @pytest.mark.parametrize("crop", [False, True])
 @pytest.mark.parametrize("kind", SENSORS)
 def test_any_perspective_sensor_survives(exported, tmp_path, kind, crop):
-    film = {"type": "hdrfilm", "width": 64, "height": 48}
+    film: dict = {"type": "hdrfilm", "width": 64, "height": 48, "rfilter": {"type": "box"}}
     if crop:
         film |= {"crop_width": 20, "crop_height": 12, "crop_offset_x": 30, "crop_offset_y": 9}
     to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0.1, 0, 0], [0, 1, 0])
@@ -183,6 +183,7 @@ def test_any_perspective_sensor_survives(exported, tmp_path, kind, crop):
     assert written.id() == 'view "7" & <8>'
     assert (written.near_clip(), written.far_clip()) == pytest.approx((2e-6, 3e7))
     assert tuple(written.film().crop_size()) == tuple(sensor.film().crop_size())
+    assert written.film().rfilter().class_name() == sensor.film().rfilter().class_name()
     at = mi.Point2f(np.random.default_rng(3).random((2, 50)).astype(np.float32))
     ours, theirs = (s.sample_ray(0, 0.5, at, mi.Point2f(0.1, 0.8))[0] for s in (written, sensor))
     np.testing.assert_allclose(np.array(ours.o), np.array(theirs.o), atol=1e-5)

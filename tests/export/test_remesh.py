@@ -67,3 +67,11 @@ def test_quality_out_of_reach():
     mesh = open_sphere(2)
     with pytest.raises(UserError, match="try another edge length or a lower quality"):
         remesh(mesh.vertices, mesh.faces, 0.2, resample_boundary=True, min_quality=0.999)
+
+
+def test_more_triangles_than_memory_holds():
+    mesh = open_sphere(2)
+    with pytest.raises(
+        UserError, match=r"some [\d,]+ triangles, needs about .+; the object's size is .+ longer edge"
+    ):
+        remesh(mesh.vertices, mesh.faces, 1e-6)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...errors import UserError
 from ...scene_files import is_scene_file, load_scene
-from ...views import PinholeViews
+from ...views import PinholeViews, filter_of
 from ..camera import Camera
 from ..decoding import image_size
 from ..file_names import existing
@@ -19,15 +19,6 @@ from ..frames import Capture, Frame, pose_of
 NAME = "Mitsuba sensors"
 
 _Y_UP = np.array([0.0, 1.0, 0.0])
-#: Plugins by the names of their classes.
-_FILTERS = {
-    "BoxFilter": "box",
-    "GaussianFilter": "gaussian",
-    "TentFilter": "tent",
-    "MitchellNetravaliFilter": "mitchell",
-    "CatmullRomFilter": "catmullrom",
-    "LanczosSincFilter": "lanczos",
-}
 
 
 def find(source: Path) -> Path | None:
@@ -102,5 +93,5 @@ def camera_of(sensor: mi.Sensor, views: PinholeViews, index: int) -> Camera:
     pose = Camera.mitsuba_pose(pose_of(matrix, f"sensor '{sensor.id()}'"))
     film = pose[:3, :3].T @ views.bases[index]
     fx, fy = width / film[0, 0], height / film[1, 1]
-    rfilter = _FILTERS.get(sensor.film().rfilter().class_name(), "gaussian")
+    rfilter = filter_of(sensor.film())
     return Camera(int(width), int(height), fx, fy, -film[0, 2] * fx, -film[1, 2] * fy, pose, rfilter=rfilter)
