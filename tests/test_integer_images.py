@@ -1,12 +1,15 @@
 """Images of 8 and 16 bits as linear values, and files that would have Pillow start other programs."""
 
+import struct
+import zlib
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image, UnidentifiedImageError
 
 from gshell_mi.float_images import image_size, read_float_image
-from gshell_mi.integer_images import open_image
+from gshell_mi.integer_images import open_image, read_integer_image
 
 VALUES = np.random.default_rng(0).integers(0, 256, (4, 6, 4), np.uint8)
 
@@ -47,3 +50,27 @@ def test_documents_that_start_programs_are_no_images(tmp_path):
     assert Image.open(tmp_path / "a.png").format == "EPS"
     with pytest.raises(UnidentifiedImageError):
         open_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("mode, clear", [("L", 40), ("RGB", (40, 50, 60))])
+def test_a_transparent_colour_is_alpha(mode, clear, tmp_path):
+    image = Image.new(mode, (2, 1), clear)
+    image.putpixel((1, 0), 90 if mode != "RGB" else (90, 90, 90))
+    image.save(tmp_path / "a.png", transparency=clear)
+    assert read_integer_image(tmp_path / "a.png")[0, :, 3].tolist() == [0, 255]
+
+
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+def test_absurd_sizes_are_refused_where_the_package_says(tmp_path):
+    """Pillow's own limit is lower, and an error of no common kind."""
+    for side, refused in ((15_000, False), (20_000, True), (60_000, True)):
+        Image.new("L", (1, 1)).save(tmp_path / "a.png")
+        data = bytearray((tmp_path / "a.png").read_bytes())
+        data[16:24] = struct.pack(">II", side, side)
+        data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+        (tmp_path / "a.png").write_bytes(data)
+        if refused:
+            with pytest.raises(ValueError, match="pixels"):
+                open_image(tmp_path / "a.png")
+        else:
+            assert image_size(tmp_path / "a.png") == (side, side)

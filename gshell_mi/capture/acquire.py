@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,10 @@ from ..integer_images import open_image
 from . import video
 from .camera import Camera
 from .config import CaptureConfig
-from .decoding import FLOAT_SUFFIXES
+from .decoding import read_pixels
 from .formats import FORMATS, colmap, read_capture
 from .frames import Capture
+from .masks import has_alpha
 from .parallel import in_order
 from .segmentation import SIZE, View, cut_out
 from .structure_from_motion import photographs_in, place, small_copy
@@ -77,22 +78,28 @@ def acquire(source: Path, output: Path, config: CaptureConfig, progress: Progres
     subject = find_subject([frame.camera for frame in capture.frames], sparse_points(model))
     if subject is not None:
         capture = replace(capture, up=subject.up)
+    if is_video:
+        capture = replace(capture, notes=(*video.notes(source), *capture.notes))
     return Acquired(capture, workspace, model, ["cameras"])
 
 
 def lacks_masks(capture: Capture) -> bool:
-    """Whether neither mask files nor any image's alpha say where the object is."""
+    """Whether neither mask files nor any image's alpha say where the object is.
+
+    Raises:
+        UserError: an image cannot be read.
+    """
     return not any(frame.mask or _has_alpha(frame.image) for frame in capture.frames)
 
 
 def _has_alpha(path: Path) -> bool:
-    if path.suffix.lower() in FLOAT_SUFFIXES:  # renderings; whether theirs is any good is told later
-        return True
     try:
-        with open_image(path) as image:
-            return "A" in image.mode or "transparency" in image.info
+        with open_image(path) as image:  # most photographs have no such channel, which is quickly seen
+            if "A" not in image.mode and "transparency" not in image.info:
+                return False
     except (OSError, SyntaxError, ValueError):
-        return True
+        pass  # of floating point, which Pillow does not know
+    return has_alpha(read_pixels(path))
 
 
 def make_masks(
@@ -125,8 +132,8 @@ def make_masks(
     job = {
         "photographs": fingerprint([frame.image for frame in capture.frames]),
         "how": config.make_masks,
-        "cameras": [[*camera.to_world.ravel(), camera.fx, camera.cx, camera.cy] for camera in cameras],
-        "background": config.background,
+        "cameras": [_numbers(camera) for camera in cameras],
+        "background": fingerprint([Path(config.background)]) if config.background else None,
         "box": subject.box.tolist(),
         "size": SIZE,
     }
@@ -143,6 +150,12 @@ def make_masks(
         frames=tuple(replace(frame, mask=file) for frame, file in zip(capture.frames, files, strict=True)),
     )
     acquired.made.append("masks")
+
+
+def _numbers(camera: Camera) -> list[float]:
+    """All that tells a camera from another of the same size."""
+    inner = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return [*camera.to_world.ravel(), *inner, *astuple(camera.distortion)]
 
 
 def _view(path: Path, camera: Camera) -> View:

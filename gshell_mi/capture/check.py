@@ -103,7 +103,7 @@ class _Sheet:
         self.thumbnails = []
         for sensor, target, camera in zip(scene.sensors, scene.targets, self.cameras, strict=True):
             image, clipped = record.photographs.get(sensor.id(), (None, 0.0))
-            name = f"{sensor.id()} ({Path(image).name})" if image else sensor.id()
+            name = f"{sensor.id()} ({image.name})" if image else sensor.id()
             self.thumbnails.append(Thumbnail.of(name, target.rgba, camera, clipped, target.known))
         box = np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
         self.warnings = find_trouble(
@@ -232,10 +232,12 @@ class _Sheet:
 
 
 def _hull(scene: FitScene, silhouettes: list[Silhouette]) -> mi.Scene | None:
-    """The visual hull of the small masks as a scene to trace rays in; None if it is empty."""
+    """The visual hull of the small masks as a scene to trace rays in; None if there is none."""
+    seen = [s for s in silhouettes if not s.is_empty]
+    if not seen:
+        return None
     lattice = TetLattice(_HULL_CELLS)
     points = mi.Transform4f(scene.subject.to_world) @ mi.Point3f(lattice.points(mi.Float))
-    seen = [s for s in silhouettes if not s.is_empty]
     views = PinholeViews(
         tuple(map(str, range(len(seen)))),
         np.array([(s.camera.width, s.camera.height) for s in seen]),

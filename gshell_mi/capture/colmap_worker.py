@@ -44,23 +44,22 @@ def run(folder: Path) -> None:
 
 def _match(folder: Path, job: dict) -> None:
     database, names = folder / "features.db", job["images"]
-    mode = pycolmap.CameraMode.SINGLE if job["single_camera"] else pycolmap.CameraMode.PER_IMAGE
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = job["features"]
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = job["camera_model"]
-    if job["camera"]:
-        focal, width, height = job["camera"]
-        reader.camera_params = f"{focal}, {width / 2}, {height / 2}, 0"
-    pycolmap.extract_features(
-        database,
-        folder / "images",
-        image_names=names,
-        camera_mode=mode,
-        reader_options=reader,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
-    )
+    for camera in job["cameras"]:
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "SIMPLE_RADIAL"
+        if camera["parameters"]:
+            reader.camera_params = ", ".join(map(str, camera["parameters"]))
+        pycolmap.extract_features(
+            database,
+            folder / "images",
+            image_names=camera["images"],
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=extraction,
+            device=pycolmap.Device.cpu,
+        )
     pairs = folder / "pairs.txt"
     pairs.write_text(
         "".join(f"{first} {second}\n" for first, second in pairs_of(names, sequential=job["sequential"])),

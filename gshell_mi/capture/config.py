@@ -98,6 +98,12 @@ class CaptureConfig:
             raise UserError(f"--frames must be at least 3, not {self.frames}.")
         if self.background is not None and self.masks is not None:
             raise UserError("Both --background and --masks are given; choose one.")
+        photograph = self.background is not None and Path(self.background).is_file()
+        if photograph and self.make_masks != "grabcut":
+            raise UserError(
+                f"--background '{self.background}' is a photograph, of which --make-masks grabcut makes "
+                f"masks, not {self.make_masks}; leave out one of the two options."
+            )
         for option, path in (("--light", self.light), ("--exposures", self.exposures)):
             if path is not None and not path.is_file():
                 raise UserError(f"File '{path}' does not exist; correct {option}.")

@@ -70,12 +70,7 @@ def assign_ignored(capture: Capture, folder: Path | None) -> Capture:
     if not folder.is_dir():
         return capture
     copies = Copies(frame.image.as_posix() for frame in capture.frames)
-    found = [copies.find(folder, frame.image.as_posix(), mask_of) for frame in capture.frames]
-    # In the folder of the capture itself, the images are named like the images.
-    found = [
-        None if file and file.samefile(frame.image) else file
-        for file, frame in zip(found, capture.frames, strict=True)
-    ]
+    found = [copies.find(folder, frame.image.as_posix(), mask_of(frame.image)) for frame in capture.frames]
     if given and not any(found):
         raise UserError(
             f"No file in '{folder}' is named like an image; name each as its image, as in "

@@ -95,7 +95,7 @@ def pose_of(matrix: object, owner: str) -> np.ndarray:
 
 
 def camera_for_image(declared: Camera, size: tuple[int, int], image: Path) -> Camera:
-    """The declared camera at the (width, height) of the image file, perhaps a shrunk copy of the original.
+    """The declared camera at the (width, height) of the image file, perhaps a copy in another size.
 
     Raises:
         UserError: their aspect ratios differ, or the declared numbers are of no camera.
@@ -109,8 +109,7 @@ def camera_for_image(declared: Camera, size: tuple[int, int], image: Path) -> Ca
         )
     if (declared.width, declared.height) == size:
         return declared
-    # A size that is rounded to whole pixels changes the aspect by up to a pixel.
-    if abs(width * declared.height / declared.width - height) > 1.0:
+    if not same_aspect((declared.width, declared.height), size):
         turned = (declared.height, declared.width) == size
         cure = (
             "it seems turned by its EXIF orientation: store it as the calibration saw it"
@@ -122,6 +121,17 @@ def camera_for_image(declared: Camera, size: tuple[int, int], image: Path) -> Ca
             f"{declared.width} x {declared.height}; {cure}."
         )
     return declared.resized(width, height)
+
+
+def same_aspect(first: tuple[int, int], second: tuple[int, int]) -> bool:
+    """Whether two (width, height) are of copies of one image: each side of the smaller one is rounded, up or
+    down, to whole pixels.
+
+    >>> same_aspect((6000, 4000), (1600, 1067)), same_aspect((6000, 4000), (1600, 1070))
+    (True, False)
+    """
+    small, large = sorted((first, second))
+    return abs(small[0] * large[1] - small[1] * large[0]) <= max(large)
 
 
 def _is_possible(camera: Camera) -> bool:

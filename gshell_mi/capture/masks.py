@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +52,8 @@ class Background:
             red, green, blue = ImageColor.getrgb(text)[:3]
         except ValueError:
             raise UserError(
-                f"--background '{text}' is no colour; give one as white, black or '#00ff00'."
+                f"--background '{text}' is neither a colour nor a file that exists; give a colour as white, "
+                f"black or '#00ff00', or a photograph of the place without the object."
             ) from None
         if not tolerance > 0:
             raise UserError(f"--background-tolerance must be positive, and is {tolerance:g}.")
@@ -98,9 +101,10 @@ def assign_masks(capture: Capture, folder: Path | None) -> Capture:
     elif not folder.is_dir():
         raise UserError(f"Mask folder '{folder}' does not exist; correct --masks.")
     copies = Copies(frame.image.as_posix() for frame in capture.frames)
-    found = [copies.find(folder, frame.image.as_posix(), mask_of) for frame in capture.frames]
+    found = [copies.find(folder, frame.image.as_posix(), mask_of(frame.image)) for frame in capture.frames]
     if not any(found):
-        inside = images_in(folder)
+        images = {frame.image.resolve() for frame in capture.frames}
+        inside = [file for file in images_in(folder) if file.resolve() not in images]
         if len(inside) != len(capture.frames):
             raise UserError(
                 f"The masks in '{folder}' have neither the images' names nor their number "
@@ -126,11 +130,20 @@ def _beside(capture: Capture) -> Path | None:
     return None
 
 
-def mask_of(image: Path) -> Path | None:
-    """The mask in the place of an image."""
-    names = (image.name, image.name + ".png", *(image.stem + suffix for suffix in SUFFIXES))
-    exact = next((image.with_name(name) for name in names if image.with_name(name).is_file()), None)
-    return exact or existing(image.with_name(image.stem)) or existing(image)
+def mask_of(image: Path) -> Callable[[Path], Path | None]:
+    """Finds the mask of an image by the place that the image would have among the masks.
+
+    Masks may lie beside their images: the image itself is none.
+    """
+
+    def find(place: Path) -> Path | None:
+        names = (place.name, place.name + ".png", *(place.stem + suffix for suffix in SUFFIXES))
+        exact = (place.with_name(name) for name in names)
+        spelled = (existing(named) for named in (place.with_name(place.stem), place))
+        files = (file for file in chain(exact, spelled) if file is not None and file.is_file())
+        return next((file for file in files if not file.samefile(image)), None)
+
+    return find
 
 
 def coverage_of(
@@ -171,11 +184,11 @@ def coverage_of(
         return 1 - coverage if inverted else coverage
     if pixels.shape[2] < 4:
         raise UserError(f"Image '{frame.image}' has no alpha, and there is no mask for it; {_SUPPLY}.")
-    alpha = np.clip(_unit(pixels[..., 3]), 0, 1)
-    if (alpha == 1).all():
+    if not has_alpha(pixels):
         raise UserError(
             f"Image '{frame.image}' has an alpha of 1 everywhere, and there is no mask for it; {_SUPPLY}."
         )
+    alpha = np.clip(_unit(pixels[..., 3]), 0, 1)
     return alpha if alpha_values(pixels) is None else stretched(alpha, white)
 
 
@@ -187,12 +200,16 @@ def mask_values(path: Path) -> np.ndarray:
     """
     mask = read_pixels(path)
     # Some tools put the mask into alpha and leave the colour empty or as it was.
-    in_alpha = mask.shape[2] == 4 and _unit(mask[..., 3]).min() < 1
-    values = mask[..., 3] if in_alpha else mask[..., :3].mean(axis=-1, dtype=np.float32)
+    values = mask[..., 3] if has_alpha(mask) else mask[..., :3].mean(axis=-1, dtype=np.float32)
     values = _unit(values, mask.dtype)
     if mask.dtype.kind == "f" and (top := float(values.max(initial=0))) >= 2:
         values = values / (255 if top <= 255 else 65535)  # what integers held
     return np.clip(values, 0, 1)
+
+
+def has_alpha(pixels: np.ndarray) -> bool:
+    """Whether stored pixels have an alpha that says anything: one of 1 everywhere does not."""
+    return pixels.shape[2] == 4 and bool(_unit(pixels[..., 3]).min() < 1)
 
 
 def alpha_values(pixels: np.ndarray) -> np.ndarray | None:

@@ -23,6 +23,10 @@ from .resample import framed, rectify, shrink
 _DECODED = 2
 #: Half floats end at 65504; a target there is far beyond what a photograph holds.
 _BRIGHTEST = 6e4
+#: Exposures of one set are no farther apart.
+_MOST_STOPS = 30
+#: Shares above this are 1, but for the rounding of means over many pixels.
+_WHOLE = 1 - 1e-3
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,8 @@ class Preparation:
         # In place, for a photograph of 24 megapixels takes 300 MB by now.
         if self.background is not None:
             rgb -= (1 - coverage) * self.decoding.linear(self._encoded(self.background.color, pixels.dtype))
-        elif not _is_premultiplied(frame, pixels):
-            rgb *= coverage
+        else:
+            _cut_out(rgb, coverage, frame, pixels)
         rgb *= np.float32(self.gains.get(frame.image, 1.0))
         np.clip(rgb, 0.0, _BRIGHTEST, out=rgb)
         known = self._known(frame, coverage, reduction)
@@ -101,7 +105,7 @@ class Preparation:
             camera,
             _clipped(pixels, coverage),
             float(coverage.max()),
-            None if (known >= 1).all() else known,
+            None if (known > _WHOLE).all() else known,
         )
 
     def _known(self, frame: Frame, coverage: np.ndarray, reduction: int) -> np.ndarray:
@@ -126,9 +130,17 @@ def _clipped(pixels: np.ndarray, coverage: np.ndarray) -> float:
     return float((pixels[covered][:, :3] == np.iinfo(pixels.dtype).max).any(axis=1).mean())
 
 
-def _is_premultiplied(frame: Frame, pixels: np.ndarray) -> bool:
-    """OpenEXR's colour is premultiplied by its own alpha, PNG's is not; a mask file cuts out anew."""
-    return frame.mask is None and pixels.shape[2] == 4 and frame.image.suffix.lower() in FLOAT_SUFFIXES
+def _cut_out(rgb: np.ndarray, coverage: np.ndarray, frame: Frame, pixels: np.ndarray) -> None:
+    """Multiplies (h, w, 3) linear colour by the coverage (h, w, 1), in place.
+
+    OpenEXR's is premultiplied by its own alpha, PNG's is not; a mask file cuts out anew.
+    """
+    if pixels.shape[2] == 4 and frame.image.suffix.lower() in FLOAT_SUFFIXES:
+        if frame.mask is None:
+            return
+        alpha = pixels[..., 3:]
+        np.divide(rgb, alpha, out=rgb, where=alpha > 0)
+    rgb *= coverage
 
 
 def exposure_gains(capture: Capture, file: Path | None, *, exif: bool = True) -> dict[Path, float]:
@@ -167,4 +179,10 @@ def _stops_from_file(file: Path, images: list[Path]) -> list[float]:
     for image in images:
         if not math.isfinite(table.get(image.name, math.nan)):
             raise UserError(f"--exposures '{file}' has no finite exposure for '{image.name}'; add it.")
-    return [table[image.name] for image in images]
+    stops = [table[image.name] for image in images]
+    if (spread := max(stops) - min(stops)) > _MOST_STOPS:
+        raise UserError(
+            f"--exposures '{file}' has exposures {spread:.3g} stops apart, and {_MOST_STOPS} are beyond any "
+            f"camera; give stops (one is twice as bright), not shutter speeds or times."
+        )
+    return stops

@@ -11,7 +11,7 @@ from PIL import Image
 from ..integer_images import open_image
 from .camera import Camera
 from .decoding import exif_orientation, read_pixels
-from .frames import Frame
+from .frames import Frame, same_aspect
 
 _JPEG = (".jpg", ".jpeg")
 #: From an image as EXIF orientation shows it to as it is stored: photographs are read as stored, as
@@ -87,7 +87,8 @@ def read_reduced_grey(path: Path, size: tuple[int, int], reduction: int) -> np.n
     """
     try:
         with open_image(path) as image:
-            if reduction == 1 or image.size != size or image.mode not in ("1", "L"):
+            grey = image.mode in ("1", "L") and "transparency" not in image.info
+            if reduction == 1 or image.size != size or not grey:
                 return None
             box = (0, 0, size[0] // reduction * reduction, size[1] // reduction * reduction)
             return np.array(image.convert("L").reduce(reduction, box), np.float32) / 255
@@ -125,8 +126,7 @@ def match_size(
     height, width = mask.shape
     if (width, height) == size and reduction == 1:
         return mask
-    # A size that is rounded to whole pixels changes the aspect by up to a pixel.
-    if abs(width * size[1] / size[0] - height) > 1.0:
+    if not same_aspect((width, height), size):
         return None
     scale = np.array([width / size[0], height / size[1]]) * reduction  # mask pixels per pixel
     reach = np.maximum(np.ceil(scale * shape[::-1] - 1e-6).astype(int) - [width, height], 0)

@@ -118,6 +118,8 @@ def find_box(silhouettes: list[Silhouette], region: np.ndarray | None = None) ->
         silhouettes: of the training views, none empty.
         region: (2, 3) where to look first, if the capture says so.
     """
+    if not silhouettes:
+        return None
     if region is None:
         center = common_point(silhouettes)
         if center is None:

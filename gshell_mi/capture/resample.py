@@ -81,28 +81,27 @@ def rectify(image: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
     Returns:
         The image and its camera; both unchanged if there is nothing to do.
     """
-    square = abs(camera.fy / camera.fx - 1) * camera.height <= _SQUARE_TOLERANCE
-    if square and not camera.distortion:
-        return image, replace(camera, fy=camera.fx)
     straight = replace(camera, fy=camera.fx, distortion=Distortion())
-    seen = _seen(camera, straight) - 0.5
-    return _sample(image, seen[..., 1], seen[..., 0]), straight
+    if (seen := _seen(camera)) is None:
+        return image, straight
+    return _sample(image, seen[..., 1] - 0.5, seen[..., 0] - 0.5), straight
 
 
 def framed(camera: Camera) -> np.ndarray:
     """(height, width) booleans: the pixels of the rectified image that the image of ``camera`` holds."""
-    if not camera.distortion:
-        straight = abs(camera.fy / camera.fx - 1) * camera.height <= _SQUARE_TOLERANCE
-        if straight:
-            return np.ones((camera.height, camera.width), bool)
-    seen = _seen(camera, replace(camera, fy=camera.fx, distortion=Distortion()))
+    if (seen := _seen(camera)) is None:
+        return np.ones((camera.height, camera.width), bool)
     return np.asarray(((seen >= 0) & (seen <= [camera.width, camera.height])).all(axis=-1))
 
 
-def _seen(camera: Camera, straight: Camera) -> np.ndarray:
-    """(height, width, 2) where ``camera`` shows the centres of the pixels of ``straight``."""
+def _seen(camera: Camera) -> np.ndarray | None:
+    """(height, width, 2) where ``camera`` shows the centres of the rectified image's pixels; None if that is
+    where they are."""
+    square = abs(camera.fy / camera.fx - 1) * camera.height <= _SQUARE_TOLERANCE
+    if square and not camera.distortion:
+        return None
     v, u = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
-    ideal = np.stack([(u - straight.cx) / straight.fx, (v - straight.cy) / straight.fy], axis=-1)
+    ideal = np.stack([u - camera.cx, v - camera.cy], axis=-1) / camera.fx
     # Beyond the fold the polynomial leads back into the image, where that point of the scene is not.
     radius = np.linalg.norm(ideal, axis=-1, keepdims=True)
     ideal *= np.minimum(1.0, 0.999 * camera.distortion.folds_at() / np.maximum(radius, 1e-9))

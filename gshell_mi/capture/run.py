@@ -117,10 +117,13 @@ class _Import:
                 steps(what, done, count)
 
         acquired = acquire(source, output, config, told)
-        if background is None:
+        if config.background is None:
             acquired.capture = assign_masks(acquired.capture, config.masks)
-            if config.make_masks != "off" and lacks_masks(acquired.capture):
-                make_masks(acquired, config, lambda capture: to_scene(capture, config.up), told)
+            wanted = config.make_masks != "off" and lacks_masks(acquired.capture)
+        else:  # comes before all other masks, as a colour or as a photograph
+            wanted = background is None
+        if wanted:
+            make_masks(acquired, config, lambda capture: to_scene(capture, config.up), told)
         capture, self.made = assign_ignored(acquired.capture, config.ignore), tuple(acquired.made)
         if config.hold_out:
             capture = capture.holding_out(config.hold_out)
@@ -181,8 +184,7 @@ class _Import:
         if self.tests:
             (folder / "test.xml").write_text(sensors_xml(self.tests, depth), encoding="utf-8")
         document = scene_xml(stem, box, self.config.resolution, self._copy_light(folder))
-        # Names that the locale cannot spell come as escaped bytes, and go back as these.
-        (partial / self.output.name).write_text(document, encoding="utf-8", errors="surrogateescape")
+        (partial / self.output.name).write_text(document, encoding="utf-8")
         write_record(folder, self._record(box))
         return CaptureResult(
             self.output, len(self.cameras), len(self.tests), box, tuple(self.warnings), self.made
@@ -244,7 +246,8 @@ class _Import:
     def _box(self) -> np.ndarray:
         if self.config.box is not None:
             return _cube(np.array(self.config.box).reshape(2, 3))
-        silhouettes = [thumbnail.silhouette for thumbnail in self.thumbnails]
+        # What is thin, such as a leaf seen edge-on, may be gone from a thumbnail.
+        silhouettes = [s for s in (thumbnail.silhouette for thumbnail in self.thumbnails) if not s.is_empty]
         region = self.capture.region
         if region is not None:
             turned = self.to_scene[:3, :3] @ region.mean(axis=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import sqlite3
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,12 +76,16 @@ def place(
             f"'{source}' has only {len(photographs)} photographs; 20 or more are needed, from "
             f"all around the object."
         )
-    sequential = sequential or len(photographs) > _ALL_PAIRS
+    many = not sequential and len(photographs) > _ALL_PAIRS
     job = {
         "photographs": fingerprint(photographs),
-        "sequential": sequential,
-        **_lens(photographs),
-        "images": [f"{index:05}.jpg" for index in range(len(photographs))],
+        "sequential": sequential or many,
+        "cameras": _cameras(photographs),
+        # Neighbours are compared, and to a camera IMG_10 comes after IMG_9.
+        "images": [
+            _copy_name(index)
+            for index in sorted(range(len(photographs)), key=lambda k: _counted(photographs[k].name))
+        ],
         "features": _FEATURES,
         "size": max(max(_scaled(image_size(path), _SIZE)) for path in photographs),
     }
@@ -87,19 +93,42 @@ def place(
     if not (folder / "models").is_dir():
         _write_copies(photographs, folder / "images", progress)
         _run_colmap(folder, job, progress)
-    return _largest(folder, photographs, source)
+    capture, model = _largest(folder, photographs, source)
+    if many:
+        note = (
+            f"{len(photographs)} photographs are too many to compare each with each: each is compared with "
+            f"those next to it by name, as a film's frames are, so their names should count up."
+        )
+        capture = replace(capture, notes=(note, *capture.notes))
+    return capture, model
 
 
-def _lens(photographs: list[Path]) -> dict:
-    """Whether one camera took them all, of what model, and its focal length in pixels of the copies."""
-    kinds = {(image_size(path), _focal_35mm(path)) for path in photographs}
-    (size, focal), *others = kinds
-    copy = _scaled(size, _SIZE)
-    return {
-        "single_camera": not others,
-        "camera_model": "SIMPLE_RADIAL",
-        "camera": [focal / 36 * max(copy), *copy] if focal and not others else None,
-    }
+def _counted(name: str) -> list[str | int]:
+    """A key that sorts the numbers in names as numbers.
+
+    >>> sorted(["IMG_10.jpg", "IMG_9.jpg"], key=_counted)
+    ['IMG_9.jpg', 'IMG_10.jpg']
+    """
+    return [int(part) if number % 2 else part for number, part in enumerate(re.split(r"(\d+)", name))]
+
+
+def _copy_name(index: int) -> str:
+    """Of the copy of a photograph by its number."""
+    return f"{index:05}.jpg"
+
+
+def _cameras(photographs: list[Path]) -> list[dict]:
+    """The cameras, as far as size and focal length tell them apart: per camera the copies of its photographs
+    and SIMPLE_RADIAL's parameters in pixels of these, None if EXIF does not tell the focal length."""
+    groups: dict[tuple, list[str]] = {}
+    for index, path in enumerate(photographs):
+        groups.setdefault((image_size(path), _focal_35mm(path)), []).append(_copy_name(index))
+    cameras = []
+    for (size, focal), images in groups.items():
+        width, height = _scaled(size, _SIZE)
+        known = [focal / 36 * max(width, height), width / 2, height / 2, 0.0] if focal else None
+        cameras.append({"images": images, "parameters": known})
+    return cameras
 
 
 def _focal_35mm(path: Path) -> float | None:
@@ -118,7 +147,7 @@ def _write_copies(photographs: list[Path], folder: Path, progress: Progress | No
     folder.mkdir(exist_ok=True)
 
     def copy(index: int) -> None:
-        target = folder / f"{index:05}.jpg"
+        target = folder / _copy_name(index)
         if not target.is_file():
             with replacing(target) as partial:
                 small_copy(photographs[index], _SIZE).save(partial, quality=95)

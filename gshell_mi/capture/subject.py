@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from ..errors import UserError
 from .camera import Camera
 
 #: Fewer points tell nothing of a plane or an object.
@@ -161,17 +162,23 @@ def _clusters(points: np.ndarray) -> np.ndarray:
 def sparse_points(model: Path, shortest: int = 3) -> np.ndarray:
     """The points (n, 3) of a COLMAP model that at least ``shortest`` photographs show; none without a file.
 
-    A file that is cut off gives those before its end.
+    A binary file that is cut off gives those before its end.
+
+    Raises:
+        UserError: a coordinate is no number.
     """
     if (model / "points3D.bin").is_file():
         return _points_bin((model / "points3D.bin").read_bytes(), shortest)
-    points = []
-    if (model / "points3D.txt").is_file():
-        for line in (model / "points3D.txt").read_text(errors="replace").splitlines():
+    points, file = [], model / "points3D.txt"
+    if file.is_file():
+        for number, line in enumerate(file.read_text(errors="replace").splitlines(), start=1):
             words = line.split()
             if line.startswith("#") or len(words) < 8 + 2 * shortest:
                 continue
-            points.append(words[1:4])
+            try:
+                points.append([float(word) for word in words[1:4]])
+            except ValueError:
+                raise UserError(f"'{file}' is malformed in line {number}; export the model again.") from None
     return np.array(points, dtype=np.float64).reshape(-1, 3)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
+from ..integer_images import read_integer_image
 from ..plain_float_images import MOST_PIXELS
 
 SUFFIXES = (".tif", ".tiff")
@@ -25,10 +26,14 @@ def read_tiff(path: Path) -> np.ndarray:
     """The pixels of the first picture, (height, width[, channels]), with alpha not yet multiplied in.
 
     Colour that the file stores multiplied by alpha (ExtraSamples 1) is divided by it; of 8 bits, the result
-    has 16, as dark edges would lose theirs.
+    has 16, as dark edges would lose theirs. What tifffile unpacks only with a package of its own (LZW, JPEG,
+    facsimile), and 1 bit, Pillow reads up to 8 bits.
     """
     with tifffile.TiffFile(path) as file:
         page = file.pages.first
+        unpacked = page.compression in tifffile.TIFF.DECOMPRESSORS
+        if page.bitspersample < 8 or (page.bitspersample == 8 and not unpacked):
+            return read_integer_image(path)
         pixels = page.asarray()
         if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and pixels.ndim == 3:
             pixels = np.moveaxis(pixels, 0, -1)

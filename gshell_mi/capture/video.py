@@ -21,6 +21,9 @@ SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 #: ffmpeg's names of what such files may be; playlists, which lead to other files, are none of them.
 _CONTAINERS = "mov,mp4,avi,matroska,webm"
 
+#: Transfer functions of films of more brightness than sRGB, as ffmpeg names them and as cameras do.
+_HDR = {"arib-std-b67": "HLG", "smpte2084": "HDR10, PQ"}
+
 #: Longer side, in pixels, of the copies that are judged.
 _JUDGED = 320
 
@@ -52,6 +55,21 @@ def cut(video: Path, workspace: Workspace, count: int, progress: Progress | None
         _write(video, choose(sharpness, change, count), folder, progress)
         done.touch()
     return sorted(folder.glob("frame_*.png"))
+
+
+def notes(video: Path) -> tuple[str, ...]:
+    """What the user should know of how a video is read, a sentence each.
+
+    Raises:
+        UserError: the file cannot be read as a video.
+    """
+    transfer = next((name for name in _HDR if name in _properties(video)["pix_fmt"]), None)
+    if transfer is None:
+        return ()
+    return (
+        f"'{video.name}' is HDR ({_HDR[transfer]}), but is read as sRGB, so its light and colours come out "
+        f"wrong: convert it to SDR, or switch HDR off in the camera.",
+    )
 
 
 def choose(sharpness: np.ndarray, change: np.ndarray, count: int) -> np.ndarray:
@@ -103,11 +121,16 @@ def _frames(video: Path, pixels: str, options: list[str]) -> Generator[Any, None
         raise UserError(f"Video '{video}' cannot be read ({reason}); convert it to MP4 again.") from error
 
 
-def _judge(video: Path, progress: Progress | None) -> tuple[np.ndarray, np.ndarray]:
-    """Per frame its sharpness and its difference from the frame before."""
+def _properties(video: Path) -> dict[str, Any]:
     opened = _frames(video, "gray", [])
     found = next(opened)
     opened.close()
+    return found
+
+
+def _judge(video: Path, progress: Progress | None) -> tuple[np.ndarray, np.ndarray]:
+    """Per frame its sharpness and its difference from the frame before."""
+    found = _properties(video)
     width, height = found["size"]
     scale = min(_JUDGED / max(width, height), 1.0)
     size = (max(round(width * scale), 2), max(round(height * scale), 2))

@@ -12,7 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..compat import write_bitmap
-from .camera import Camera
+from ..json_files import read_json
+from .camera import Camera, rigid
 
 #: Says where everything came from.
 RECORD = "capture.json"
@@ -120,7 +121,8 @@ def write_known(path: Path, known: np.ndarray) -> None:
 
 def write_record(folder: Path, record: dict) -> None:
     text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
-    (folder / RECORD).write_text(text, encoding="utf-8", errors="surrogateescape")
+    # Names of photographs that are not UTF-8 become JSON's own escapes.
+    (folder / RECORD).write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 @dataclass(frozen=True)
@@ -132,15 +134,15 @@ class Record:
         to_scene: (4, 4) how the capture's world was turned.
     """
 
-    photographs: dict[str, tuple[str, float]] = field(default_factory=dict)
+    photographs: dict[str, tuple[Path, float]] = field(default_factory=dict)
     to_scene: np.ndarray = field(default_factory=lambda: np.eye(4))
 
 
 def read_record(folder: Path) -> Record:
-    """The record in the folder of a scene's targets."""
+    """The record in the folder of a scene's targets; an empty one if it is missing or damaged."""
     try:
-        stored = json.loads((folder / RECORD).read_text(encoding="utf-8", errors="surrogateescape"))
-        photographs = {view["id"]: (view["image"], float(view["clipped"])) for view in stored["views"]}
-        return Record(photographs, np.array(stored["capture_to_scene"], dtype=np.float64).reshape(4, 4))
-    except (OSError, ValueError, KeyError, TypeError):
+        stored = read_json(folder / RECORD)
+        photographs = {view["id"]: (Path(view["image"]), float(view["clipped"])) for view in stored["views"]}
+        return Record(photographs, rigid(np.array(stored["capture_to_scene"], np.float64).reshape(4, 4)))
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return Record()

@@ -132,7 +132,7 @@ def _triptych(path: Path) -> np.ndarray:
 def _pixels(path: Path) -> np.ndarray:
     try:
         return np.asarray(open_image(path).convert("RGB"))
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (OSError, SyntaxError, ValueError) as error:
         raise UserError(f"'{path}' cannot be read as an image; remove it, or run the fit again.") from error
 
 

@@ -137,6 +137,31 @@ def test_masks_are_found_by_name_else_by_order(names, tmp_path):
     assert [frame.mask.name for frame in found] == names
 
 
+@pytest.mark.parametrize("named", [True, False])
+def test_a_photograph_is_not_its_own_mask(named, tmp_path):
+    """Masks beside the photographs."""
+    for file in ("a.jpg", "b.c.jpg", *(("a.jpg.png", "b.c.png") if named else ())):
+        Image.new("L", (8, 6)).save(tmp_path / file)
+    frames = tuple(Frame(tmp_path / file, camera()) for file in ("a.jpg", "b.c.jpg"))
+    if not named:
+        with pytest.raises(UserError, match="0 masks, 2 images"):
+            assign_masks(Capture("test", tmp_path, frames), tmp_path)
+        return
+    found = assign_masks(Capture("test", tmp_path, frames), tmp_path).frames
+    assert [frame.mask.name for frame in found] == ["a.jpg.png", "b.c.png"]
+
+
+def test_a_mask_cuts_anew_what_its_file_has_premultiplied(tmp_path):
+    """Or the outline would be darkened by the square of its coverage."""
+    alpha = np.tile(np.float32([0, 0.25, 0.5, 1]), (6, 2))[..., None]
+    color = np.full((6, 8, 3), np.float32(0.8))
+    color[:, ::4] = 0
+    mi.Bitmap(np.concatenate([color * alpha, alpha], -1)).write(str(tmp_path / "a.exr"))
+    mi.Bitmap(alpha).write(str(tmp_path / "m.exr"))
+    result = Preparation().target(Frame(tmp_path / "a.exr", camera(), mask=tmp_path / "m.exr")).rgba
+    np.testing.assert_allclose(result, np.concatenate([color * alpha, alpha], -1), atol=1e-6)
+
+
 def test_a_known_background_is_taken_away(tmp_path):
     """Also from the pixels at the outline, which mix both colours."""
     green = np.array([0, 200, 0])
@@ -200,6 +225,15 @@ def test_given_exposures_scale_the_target(tmp_path):
     a, b = (Preparation(gains=gains).target(frame).rgba for frame in frames)
     np.testing.assert_allclose(b[..., :3], 4 * a[..., :3], rtol=1e-5)
     np.testing.assert_array_equal(a[..., 3], b[..., 3])
+
+
+def test_times_are_no_stops(tmp_path):
+    for name in ("a.png", "b.png"):
+        Image.fromarray(RGBA).save(tmp_path / name)
+    (tmp_path / "stops.json").write_text(json.dumps({"a.png": 4000, "b.png": 60}))
+    frames = tuple(Frame(tmp_path / name, camera()) for name in ("a.png", "b.png"))
+    with pytest.raises(UserError, match=r"stops\.json' has exposures 3.94e\+03 stops apart, .* not shutter"):
+        exposure_gains(Capture("test", tmp_path, frames), tmp_path / "stops.json")
 
 
 # --- resampling

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -17,6 +18,7 @@ from gshell_mi.capture.__main__ import main
 from gshell_mi.capture.check import check_scene
 from gshell_mi.capture.region import Silhouette, agreement, common_point, find_box
 from gshell_mi.capture.trouble import ENOUGH_VIEWS, Thumbnail, find_trouble
+from gshell_mi.capture.writer import RECORD, read_record, write_record
 from gshell_mi.errors import UserError
 from gshell_mi.scene import load_fit_scene
 
@@ -179,6 +181,25 @@ def test_views_with_empty_masks_are_left_out(source, tmp_path):
     assert "1 view with an empty mask is left out: r_7.png." in result.warnings
 
 
+def test_views_that_show_the_object_as_a_thread_are_no_obstacle(source, tmp_path):
+    """A leaf seen edge-on: at the size at which the box is sought, its mask is gone."""
+    write_nerf(tmp_path / "set", known_cameras(4, width=400, height=300, fx=460, fy=460, cx=200, cy=150))
+    thread = np.zeros((300, 400, 4), np.uint8)
+    thread[100:200, 200] = 255
+    Image.fromarray(thread).save(tmp_path / "set/train/r_1.png")
+    result = import_capture(tmp_path / "set", tmp_path / "s.xml")
+    assert result.training == 4
+    np.testing.assert_allclose(result.box.mean(axis=0)[[0, 2, 1]] * [1, -1, 1], BALL, atol=0.15)
+    for index in range(4):
+        Image.fromarray(thread).save(tmp_path / f"set/train/r_{index}.png")
+    with pytest.raises(UserError, match="have no common volume"):
+        import_capture(tmp_path / "set", tmp_path / "t.xml")
+    boxed = CaptureConfig(box=(-1, -1, -1, 1, 1, 1))
+    report = check_scene(import_capture(tmp_path / "set", tmp_path / "t.xml", config=boxed).path)
+    assert any("are empty" in warning for warning in report.warnings)
+    assert any("no common volume in the box" in warning for warning in report.warnings)
+
+
 def test_another_colour_profile_is_noticed(source, tmp_path):
     shutil.copytree(source, tmp_path / "set")
     first = tmp_path / "set/train/r_0.png"
@@ -217,6 +238,29 @@ def test_geographic_coordinates_keep_their_precision(source, tmp_path):
             center = np.array(sensor.world_transform().matrix).reshape(4, 4)[:3, 3]
             expected = matrix[:3, :3] @ (truth.origin + away) + matrix[:3, 3]
             np.testing.assert_allclose(center, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        "[" * 20000,
+        '{"views": [{"id": "view_000", "image": 7, "clipped": 0}], "capture_to_scene": %s}',
+        '{"views": [{"id": "view_000", "image": "a", "clipped": 1'
+        + "0" * 400
+        + '}], "capture_to_scene": %s}',
+        '{"views": [], "capture_to_scene": [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]}',
+    ],
+)
+def test_a_damaged_record_is_none(record, tmp_path):
+    (tmp_path / RECORD).write_text(record.replace("%s", str(np.eye(4).tolist())))
+    found = read_record(tmp_path)
+    assert found.photographs == {} and (found.to_scene == np.eye(4)).all()
+
+
+def test_records_hold_names_that_are_not_utf_8(tmp_path):
+    view = {"id": "view_000", "image": "/a/\udcffé.png", "clipped": 0.0}
+    write_record(tmp_path, {"views": [view], "capture_to_scene": np.eye(4).tolist()})
+    assert read_record(tmp_path).photographs == {"view_000": (Path("/a/\udcffé.png"), 0.0)}
 
 
 # --- where the object is

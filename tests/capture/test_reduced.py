@@ -1,12 +1,14 @@
 """JPEG files that are decoded at a fraction of their size."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from known_capture import known_cameras
 from PIL import Image
 
 from gshell_mi.capture import Camera
-from gshell_mi.capture.frames import Frame
+from gshell_mi.capture.frames import Frame, camera_for_image, same_aspect
 from gshell_mi.capture.parallel import in_order
 from gshell_mi.capture.prepare import Preparation
 from gshell_mi.capture.reduced import match_size, read_reduced, reduced_camera
@@ -64,6 +66,30 @@ def test_masks_of_another_size_but_the_same_aspect_fit():
     smaller = match_size(mask, (40, 30), (8, 10), 4)
     np.testing.assert_array_equal(smaller, np.tile(np.repeat([0.0, 1.0], 5), (8, 1)))
     assert match_size(mask, (300, 400), (400, 300), 1) is None
+
+
+@pytest.mark.parametrize(
+    "large, small",
+    [
+        ((6000, 4000), (1600, 1067)),
+        ((5472, 3648), (1600, 1067)),
+        ((6960, 4640), (1600, 1067)),
+        ((4000, 6000), (1067, 1600)),
+        ((4033, 3025), (1008, 756)),
+        ((4031, 3023), (1008, 756)),
+    ],
+)
+def test_copies_have_the_aspect_that_rounding_leaves(large, small):
+    """Rounded, cut off or rounded up: a camera or a mask for either fits the other, but none a pixel away."""
+    for first, second in ((large, small), (small, large)):
+        assert same_aspect(first, second)
+        camera = Camera(*first, 2000.0, 2000.0, first[0] / 2, first[1] / 2, np.eye(4))
+        fitted = camera_for_image(camera, second, Path("a.jpg"))
+        assert (fitted.width, fitted.height) == second and fitted.cx == pytest.approx(second[0] / 2)
+    assert not same_aspect(large, (small[0], small[1] - 2))
+    assert not same_aspect(large, large[::-1])
+    mask = np.ones(large[::-1], np.float32)
+    assert (match_size(mask, small, small[::-1], 1) == 1).all()
 
 
 def test_work_in_order_tells_errors_and_stops():

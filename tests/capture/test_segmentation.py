@@ -1,14 +1,18 @@
 """Masks made where there are none."""
 
+import os
 import sys
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import photographed
 import pytest
+import tifffile
+from known_capture import known_cameras, write_nerf
 from PIL import Image
 
-from gshell_mi.capture import CaptureConfig, network
+from gshell_mi.capture import CaptureConfig, Distortion, import_capture, network
 from gshell_mi.capture.acquire import Acquired, _boxed, _with_priors, lacks_masks, make_masks
 from gshell_mi.capture.frames import Capture, Frame
 from gshell_mi.capture.segmentation import View, cut_out
@@ -67,6 +71,62 @@ def test_every_frame_gets_a_mask_once(shots, tmp_path, monkeypatch):
 def test_images_with_alpha_lack_no_masks(tmp_path):
     Image.new("RGBA", (4, 4)).save(tmp_path / "a.png")
     assert not lacks_masks(Capture("test", tmp_path, (Frame(tmp_path / "a.png", None),)))
+
+
+@pytest.mark.parametrize("name", ["a.png", "b.exr", "c.tif", "d.hdr", "e.pfm", "f.jpg"])
+def test_an_alpha_that_says_nothing_is_no_mask(name, tmp_path):
+    """Opaque everywhere, or of a kind of file that may hold alpha but has none here."""
+    pixels, path = np.ones((6, 8, 4), np.float32), tmp_path / name
+    if name.endswith("png"):
+        Image.fromarray((255 * pixels).astype(np.uint8)).save(path)
+    elif name.endswith("tif"):
+        tifffile.imwrite(path, pixels[..., :3], photometric="rgb")
+    elif name.endswith("jpg"):
+        Image.new("RGB", (8, 6)).save(path)
+    else:
+        mi.Bitmap(pixels if name.endswith("exr") else pixels[..., :3].copy()).write(str(path))
+    assert lacks_masks(Capture("test", tmp_path, (Frame(path, None),)))
+
+
+def test_masks_are_made_again_for_another_background_or_lens(shots, tmp_path, monkeypatch):
+    """Of the same name, too."""
+    cameras, images, _ = shots
+    Image.fromarray(images[0]).save(tmp_path / "a.png")
+    config = CaptureConfig(background=str(tmp_path / "empty.png"), box=(-0.7, 0.02, -0.7, 0.7, 1.2, 0.7))
+    calls = []
+
+    def cut(views, subject, progress):
+        calls.append(views)
+        return [np.zeros((120, 160), np.uint8)]
+
+    def make(camera):
+        capture = Capture("test", tmp_path, (Frame(tmp_path / "a.png", camera),))
+        make_masks(Acquired(capture, Workspace(tmp_path / "s.work")), config, lambda capture: np.eye(4))
+        return len(calls)
+
+    monkeypatch.setattr("gshell_mi.capture.acquire.cut_out", cut)
+    Image.fromarray(images[1]).save(tmp_path / "empty.png")
+    assert (make(cameras[0]), make(cameras[0])) == (1, 1)
+    Image.fromarray(images[2][:, ::-1]).save(tmp_path / "empty.png")
+    os.utime(tmp_path / "empty.png", ns=(0, 0))
+    assert make(cameras[0]) == 2
+    assert make(replace(cameras[0], fy=cameras[0].fy + 1)) == 3
+    assert make(replace(cameras[0], distortion=Distortion(k1=0.01))) == 4
+
+
+def test_a_photograph_of_the_background_comes_before_the_masks_that_are_there(tmp_path, monkeypatch):
+    """As a colour does; and makers of masks that have no use for it are refused."""
+    write_nerf(tmp_path / "set", known_cameras(3))
+    Image.new("RGB", (60, 44)).save(tmp_path / "empty.png")
+    full = np.full((44, 60), 255, np.uint8)
+    full[:5] = 0
+    monkeypatch.setattr("gshell_mi.capture.acquire.cut_out", lambda views, *_: [full] * len(views))
+    photograph = str(tmp_path / "empty.png")
+    result = import_capture(tmp_path / "set", tmp_path / "s.xml", config=CaptureConfig(background=photograph))
+    assert result.made == ("masks",)
+    for maker in ("off", "rembg"):
+        with pytest.raises(UserError, match=f"is a photograph, .* not {maker}; leave out"):
+            CaptureConfig(background=photograph, make_masks=maker)
 
 
 def test_box_is_told_in_the_scene():

@@ -2,9 +2,11 @@
 
 import json
 import os
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from gshell_mi.capture import structure_from_motion
 from gshell_mi.capture.__main__ import main
+from gshell_mi.capture.frames import Capture
 from gshell_mi.capture.stationary import stationary_features
 from gshell_mi.capture.structure_from_motion import photographs_in, place
 from gshell_mi.capture.workspace import Workspace
@@ -110,6 +113,40 @@ def test_photographs_of_nothing_find_no_cameras(tmp_path):
         Image.new("RGB", (64, 48), (90, 90, 90)).save(tmp_path / f"{index}.jpg")
     with pytest.raises(UserError, match="COLMAP found no cameras"):
         place(photographs_in(tmp_path), tmp_path, Workspace(tmp_path / "out" / "s.work"))
+
+
+@needs_extras
+def test_photographs_of_one_size_and_focal_length_share_a_camera(tmp_path):
+    for index, (size, focal) in enumerate([((64, 48), 24), ((48, 64), 24), ((64, 48), 50), ((64, 48), 24)]):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0xA405] = focal
+        Image.new("RGB", size, (90, 90, 90)).save(tmp_path / f"{index}.jpg", exif=exif)
+    with pytest.raises(UserError, match="COLMAP found no cameras"):
+        place(photographs_in(tmp_path), tmp_path, Workspace(tmp_path / "out" / "s.work"))
+    with closing(sqlite3.connect(tmp_path / "out" / "s.work" / "colmap" / "features.db")) as base:
+        rows = base.execute(
+            "SELECT name, params, width FROM images JOIN cameras USING (camera_id) ORDER BY name"
+        )
+        focal, width = zip(*((np.frombuffer(params)[0], width) for _, params, width in rows), strict=True)
+        assert base.execute("SELECT COUNT(*) FROM cameras").fetchone() == (3,)
+    np.testing.assert_allclose(focal, np.array([24, 24, 50, 24]) / 36 * 64)
+    assert width == (64, 48, 64, 64)
+
+
+def test_many_photographs_are_neighbours_by_the_numbers_in_their_names(tmp_path, monkeypatch):
+    """And that only neighbours are compared is told."""
+    for index in range(5):
+        Image.new("RGB", (64, 48)).save(tmp_path / f"IMG_{8 + index}.jpg")
+    jobs, empty = [], Capture("test", tmp_path, ())
+    monkeypatch.setattr(structure_from_motion, "_ALL_PAIRS", 4)
+    monkeypatch.setattr(structure_from_motion, "_run_colmap", lambda folder, job, progress: jobs.append(job))
+    monkeypatch.setattr(structure_from_motion, "_largest", lambda *_: (empty, tmp_path))
+    monkeypatch.setattr(structure_from_motion.importlib.util, "find_spec", lambda name: name)
+    photographs = photographs_in(tmp_path)
+    capture, _ = place(photographs, tmp_path, Workspace(tmp_path / "s.work"))
+    names = [photographs[int(name.removesuffix(".jpg"))].name for name in jobs[0]["images"]]
+    assert names == [f"IMG_{8 + index}.jpg" for index in range(5)] and jobs[0]["sequential"]
+    assert "5 photographs are too many" in capture.notes[0]
 
 
 def aligned_errors(found, true):

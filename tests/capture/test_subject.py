@@ -7,6 +7,7 @@ import photographed
 import pytest
 
 from gshell_mi.capture.subject import find_subject, sparse_points
+from gshell_mi.errors import UserError
 
 
 def test_the_object_stands_on_its_floor():
@@ -56,3 +57,9 @@ def test_points_of_colmap_models(binary, tmp_path):
         (tmp_path / "points3D.txt").write_text("# 3D point list\n" + "\n".join(lines))
     np.testing.assert_array_equal(sparse_points(tmp_path), [[1, 2, 3], [0, 0, 9]])
     assert sparse_points(tmp_path / "none").shape == (0, 3)
+
+
+def test_points_that_are_no_numbers_are_told(tmp_path):
+    (tmp_path / "points3D.txt").write_text("# 3D point list\n0 1.0 two 3.0 9 9 9 0.5 " + "1 2 " * 3)
+    with pytest.raises(UserError, match=r"points3D\.txt' is malformed in line 2; export"):
+        sparse_points(tmp_path)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 from gshell_mi.capture.decoding import image_size, read_pixels
 from gshell_mi.errors import UserError
@@ -57,3 +58,27 @@ def test_colours_of_no_known_kind_are_told(tmp_path):
     path.write_bytes(data)
     with pytest.raises(UserError, match="12345"):
         read_pixels(path)
+
+
+@pytest.mark.parametrize("compression", ["tiff_lzw", "jpeg", "packbits", "tiff_adobe_deflate"])
+def test_compressed_photographs(compression, tmp_path):
+    stored = np.tile(np.array([200, 100, 50], np.uint8), (16, 16, 1))
+    Image.fromarray(stored).save(tmp_path / "a.tif", compression=compression)
+    found = read_pixels(tmp_path / "a.tif")
+    assert found.shape == (16, 16, 3) and np.abs(found.astype(int) - stored).max() < 4
+
+
+@pytest.mark.parametrize("compression", [None, "group4", "tiff_lzw"])
+def test_masks_of_one_bit(compression, tmp_path):
+    stored = PIXELS[..., 0] > 0.5
+    Image.fromarray(stored).save(tmp_path / "a.tif", compression=compression)
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.tif")[..., 0], 255 * stored)
+
+
+def test_sixteen_bits_that_nothing_here_unpacks_are_told(tmp_path):
+    """Pillow would hand out 8 of them."""
+    Image.fromarray((65535 * PIXELS[..., 0]).astype(np.uint16)).save(
+        tmp_path / "a.tif", compression="tiff_lzw"
+    )
+    with pytest.raises(UserError, match="imagecodecs"):
+        read_pixels(tmp_path / "a.tif")

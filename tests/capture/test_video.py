@@ -80,3 +80,21 @@ def test_what_is_no_video_is_told(clip, tmp_path):
     with pytest.raises(UserError, match=r"v\.mp4' cannot be read"):
         video.cut(tmp_path / "v.mp4", Workspace(tmp_path / "s.work"), 4)
     assert video.is_video(tmp_path / "v.mp4") and not video.is_video(tmp_path / "none.mp4")
+
+
+@pytest.mark.parametrize("transfer, words", [("arib-std-b67", "HLG"), ("smpte2084", "PQ"), ("bt709", None)])
+def test_films_of_high_dynamic_range_are_told(transfer, words, tmp_path):
+    path = tmp_path / "v.mp4"
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        (64, 64),
+        codec="libx264",
+        pix_fmt_out="yuv420p10le",
+        output_params=["-vf", f"setparams=color_primaries=bt2020:color_trc={transfer}:colorspace=bt2020nc"],
+    )
+    writer.send(None)
+    for _ in range(4):
+        writer.send(bytes(64 * 64 * 3))
+    writer.close()
+    found = video.notes(path)
+    assert [words in note for note in found] == ([True] if words else [])
