@@ -20,10 +20,10 @@ def finite(value: mi.Float) -> mi.Float:
 def trusted(gradient: mi.Float, most: float = 30.0) -> mi.Float:
     """Derivatives of which none is larger than ``most`` times the mean size of those that are not 0.
 
-    Slivers make derivatives overflow, or nearly; they count as 0 then. And where a derivative is that of a ratio, such
-    as of a crossing between two values near 0, or of a hit of a triangle seen from its edge, one sample may
-    outweigh the whole surface. Adam with one step size for all goes by the largest derivative and remembers
-    it for a hundred to a thousand steps, so one such vertex would hold up all others.
+    Slivers make derivatives overflow, or nearly; they count as 0 then. And where a derivative is that of a
+    ratio, such as of a crossing between two values near 0, or of a hit of a triangle seen from its edge, one
+    sample may outweigh the whole surface. Adam with one step size for all goes by the largest derivative and
+    remembers it for a hundred to a thousand steps, so one such vertex would hold up all others.
 
     >>> gradient = dr.ones(mi.Float, 1000)
     >>> gradient[7], gradient[8] = -1e5, dr.nan

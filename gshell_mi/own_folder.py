@@ -55,14 +55,7 @@ KINDS = {
         "test/test_*.exr",
     ),
     "dataset": ("dataset.json", "statistics.json", "sheet.png", "shards/*.npz"),
-    "model": (
-        "model.json",
-        "weights.safetensors",
-        "checkpoint.safetensors",
-        "log.jsonl",
-        "codec.npz",
-        "samples/*.png",
-    ),
+    "model": ("model.json", "weights.safetensors", "checkpoint.safetensors", "log.jsonl", "samples/*.png"),
     "generate": (
         "samples.json",
         "sheet.png",

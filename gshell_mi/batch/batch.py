@@ -25,6 +25,8 @@ _SUBMITTED = 2000
 #: Bytes for what is handed from job to job, which is next to nothing; by default Ray takes 30 % of the
 #: memory, and does not start where others use it.
 _OBJECT_STORE = 128 << 20
+#: What the page of results shows of each, beside what it told.
+_COLUMNS = ("name", "status", "psnr", "seconds")
 
 
 def run_batch(
@@ -109,7 +111,7 @@ def _run_all(
             f"ray start --head, or leave --address out."
         ) from error
     try:
-        remote = ray.remote(max_retries=retries)(run_job)
+        remote = ray.remote(max_retries=0)(run_job)  # tries are counted here
         tries: dict[str, int] = {}
         running: dict = {}
         columns = (
@@ -172,9 +174,9 @@ def _write(folder: OwnFolder, name: str, text: str) -> None:
 def _page(rows: list[dict]) -> str:
     """A table of results, the worst first."""
     body = "".join(
-        f"<tr class='{row['status']}'><td>{html.escape(row['name'])}</td><td>{row['status']}</td>"
-        f"<td>{row.get('psnr', '')}</td><td>{row['seconds']}</td>"
-        f"<td><pre>{html.escape(row['told'])}</pre></td></tr>\n"
+        f"<tr class='{html.escape(row['status'])}'>"
+        + "".join(f"<td>{html.escape(str(row.get(key, '')))}</td>" for key in _COLUMNS)
+        + f"<td><pre>{html.escape(row['told'])}</pre></td></tr>\n"
         for row in rows
     )
     return (

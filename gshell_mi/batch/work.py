@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+from ..json_files import read_json_object
 from ..lifetime import end_with_parent
 from .jobs import OUT, Job
 
-#: Written last, beside the results of a job that came to its end.
+#: Lies beside a job's results: which job was started there, and what became of it.
 DONE = "job.json"
+#: Commands that refuse a folder with their own results, unless they are told to replace them.
+_CAREFUL = ("capture", "fit")
 _KEPT_LINES = 20
 
 
 def run_job(job: Job, results: str) -> dict:
     """Runs a job and leaves its files in ``results/NAME``; returns what became of it.
 
-    A fit that was cut off goes on from its checkpoint, where the results are on a disk. Results on other
-    storage are written whole after the job.
+    A fit that was cut off goes on from its checkpoint, where the results are on a disk; what a job of other
+    arguments has left there is replaced. Results on other storage are written whole after the job.
 
     Args:
         results: a folder, or any URL that ``fsspec`` knows.
@@ -34,14 +40,19 @@ def run_job(job: Job, results: str) -> dict:
     if "://" not in results:
         folder = Path(results) / job.name
         folder.mkdir(parents=True, exist_ok=True)
-        found = _run(job, folder / "out")
+        try:
+            earlier = read_json_object(folder / DONE).get("job")
+        except (OSError, ValueError):
+            earlier = None
+        _write_done(folder / DONE, {"name": job.name, "job": _identity(job), "status": "started"})
+        found = _run(job, folder / "out", again=earlier == _identity(job))
         _write_done(folder / DONE, found)
         return found
     import fsspec
 
     with tempfile.TemporaryDirectory(prefix="gshell_mi_") as scratch:
         out = Path(scratch) / "out"
-        found = _run(job, out)
+        found = _run(job, out, again=False)
         storage, root = fsspec.core.url_to_fs(results)
         target = f"{root.rstrip('/')}/{job.name}"
         if out.is_dir():
@@ -64,19 +75,39 @@ def finished(results: str, jobs: list[Job]) -> dict[str, dict]:
         try:
             with storage.open(f"{root.rstrip('/')}/{job.name}/{DONE}", "r") as file:
                 told = json.load(file)
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             continue
-        if isinstance(told, dict) and told.get("status") == "done" and told.get("job") == _identity(job):
+        if _is_good_end(told, job):
             found[job.name] = told
     return found
 
 
-def _run(job: Job, out: Path) -> dict:
+def _is_good_end(told: object, job: Job) -> bool:
+    """Whether a file that anybody may have written says that the job is done, and is whole."""
+    return (
+        isinstance(told, dict)
+        and [told.get(key) for key in ("status", "job", "name")] == ["done", _identity(job), job.name]
+        and isinstance(told.get("told"), str)
+        and all(
+            isinstance(x, float) and math.isfinite(x) for x in (told.get("seconds"), told.get("psnr", 0.0))
+        )
+    )
+
+
+def _run(job: Job, out: Path, *, again: bool) -> dict:
+    """Runs a job; returns what became of it.
+
+    Args:
+        out: the folder of its results.
+        again: whether this very job was the last to write there.
+    """
     arguments = job.filled_in(str(out))
+    output = _output(arguments)
     if any(f"{OUT}/" in argument for argument in job.arguments):
         out.mkdir(exist_ok=True)
-    elif job.command == "fit" and out.is_dir():
-        arguments.append("--resume" if (out / "checkpoint.npz").is_file() else "--overwrite")
+    # Results elsewhere may be anybody's.
+    if job.command in _CAREFUL and output is not None and output.is_relative_to(out):
+        arguments.append("--resume" if again and _can_resume(output) else "--overwrite")
     environment = dict(os.environ)
     environment.setdefault("OPENBLAS_NUM_THREADS", "1")
     started = time.perf_counter()
@@ -101,10 +132,30 @@ def _run(job: Job, out: Path) -> dict:
         "told": "" if code == 0 else "\n".join(told),
     }
     try:
-        score = json.loads((out / "metrics.json").read_text(encoding="utf-8"))["psnr_training"]
-        return found | {"psnr": round(float(score), 3)}
+        score = round(float(read_json_object((output or out) / "metrics.json")["psnr_training"]), 3)
     except (OSError, ValueError, KeyError, TypeError):
         return found
+    # What failed has left an earlier one's.
+    return found | {"psnr": score} if code == 0 and math.isfinite(score) else found
+
+
+def _output(arguments: list[str]) -> Path | None:
+    """Where a command writes that has these arguments, by the last ``-o`` or ``--output``; None without one.
+
+    >>> _output(["a.xml", "-o", "x"]), _output(["-o", "x", "--output=y"]), _output(["a.xml"])
+    (PosixPath('x'), PosixPath('y'), None)
+    """
+    found = None
+    for word, after in itertools.pairwise([*arguments, ""]):
+        if option := re.fullmatch(r"(?:--output(?:=|$)|-o=?)(.*)", word, re.DOTALL):
+            found = Path(option[1] or after)
+    return found
+
+
+def _can_resume(output: Path) -> bool:
+    from ..export import can_resume  # loads Mitsuba, which few jobs need here
+
+    return can_resume(output)
 
 
 def _identity(job: Job) -> list[str]:

@@ -10,7 +10,7 @@ from ..mesh_files import check_triangles, read_triangles
 from ..topology import vertex_components
 from .orientation import oriented
 
-#: Vertices whose coordinates agree in so many decimals, in units of a lattice from -1 to 1, are one.
+#: Vertices that agree in so many decimals, where the mesh is as large as the cube [-1, 1]^3, are one.
 _DECIMALS = 6
 
 
@@ -45,13 +45,17 @@ def loaded_mesh(
         vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
         if np.linalg.det(matrix[:3, :3]) < 0:
             faces = faces[:, ::-1]
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    # Files may have any units. A power of two loses no digit.
+    size = 2.0 ** np.ceil(np.log2(np.ptp(vertices, axis=0).max() / 2))
+    mesh = trimesh.Trimesh(vertices / size, faces, process=False)
     mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=_DECIMALS)
     mesh.update_faces(mesh.nondegenerate_faces())
     mesh.update_faces(np.unique(np.sort(mesh.faces, axis=1), axis=0, return_index=True)[1])
     if len(mesh.faces) == 0:
         raise UserError(f"{name}: holds no triangles with an area")
-    return oriented(without_pinches(mesh))
+    mesh = oriented(without_pinches(mesh))
+    mesh.vertices = mesh.vertices * size
+    return mesh
 
 
 def without_pinches(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -67,6 +67,8 @@ def _make(given: _Arguments) -> None:
         )
     if given.garments > _MOST_GARMENTS:
         raise UserError(f"--garments must be at most {_MOST_GARMENTS}, not {given.garments}.")
+    if given.seed < 0:
+        raise UserError(f"--seed must not be negative, but is {given.seed}.")
     check_positive("--max-chamfer", given.max_chamfer)
     if given.side % 8 or not 16 <= given.side <= 256:
         raise UserError(f"--side must be a multiple of 8 from 16 to 256, not {given.side}.")

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,6 +52,18 @@ class Shard:
 
     def fields(self, index: int) -> TruncatedFields:
         return TruncatedFields.stored(self.sdf[index], self.msdf[index])
+
+
+class Split(NamedTuple):
+    """The n objects of a set that are to be learned, or those held out."""
+
+    records: list[Record]
+    sdf: np.ndarray
+    """(n, N, N, N) float16: signed distances."""
+    msdf: np.ndarray
+    """(n, N, N, N) float16."""
+    points: np.ndarray
+    """(n, 2048, 3) float16."""
 
 
 @dataclass(frozen=True)
@@ -119,20 +132,28 @@ class DataSet:
             for record in read_records(self.shard_path(number))
         ]
 
-    def load(self, *, held_out: bool) -> tuple[list[Record], np.ndarray, np.ndarray, np.ndarray]:
-        """Records, signed distances and mSDFs (n, N, N, N) float16 and points (n, 2048, 3) of one split.
+    def load(self, *, held_out: bool) -> Split:
+        """``load_splits`` of one split."""
+        return self.load_splits(held_out)[0]
+
+    def load_splits(self, *splits: bool) -> list[Split]:
+        """Some splits, of which True is what is held out, in one pass, as shards take long to unpack.
 
         Raises:
-            UserError: there are none, or a shard is damaged.
+            UserError: one has no objects, or a shard is damaged.
         """
-        records, parts = [], []
+        found: list[tuple[list[Record], list]] = [([], []) for _ in splits]
         for shard in self.shards():
-            chosen = [i for i, record in enumerate(shard.records) if record.held_out == held_out]
-            records += [shard.records[i] for i in chosen]
-            parts.append((shard.sdf[chosen], shard.msdf[chosen], shard.points[chosen]))
-        self._check_some(records, held_out=held_out)
-        sdf, msdf, points = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        return records, sdf, msdf, points
+            for held_out, (records, parts) in zip(splits, found, strict=True):
+                chosen = [i for i, record in enumerate(shard.records) if record.held_out == held_out]
+                records += [shard.records[i] for i in chosen]
+                parts.append((shard.sdf[chosen], shard.msdf[chosen], shard.points[chosen]))
+        for held_out, (records, _) in zip(splits, found, strict=True):
+            self._check_some(records, held_out=held_out)
+        return [
+            Split(records, *(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+            for records, parts in found
+        ]
 
     def load_points(self, *, held_out: bool) -> tuple[list[Record], np.ndarray]:
         """Records and points (n, 2048, 3) float16 of one split, without the fields.

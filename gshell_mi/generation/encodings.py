@@ -115,7 +115,7 @@ class BlockEncoding:
     def encode(self, fields: TruncatedFields) -> dict[str, np.ndarray]:
         per_side = _blocks_per_side(fields.side)
         near = _near_surface(fields)
-        active = _split(near[None], per_side)[:, :].any(axis=1)
+        active = _split(near[None], per_side).any(axis=1)
         values = _split(np.stack([fields.sdf, fields.msdf]), per_side)
         blocks = np.flatnonzero(active)
         return {"blocks": blocks, "values": values[blocks]}

@@ -27,6 +27,7 @@ from ..wording import counted
 from .contact_sheet import picture, write_sheet
 from .converted import converted
 from .data_set import SHARD, DataSet, read_config, read_shard, write_config, write_shard
+from .own_process import told_if_killed
 from .sources import Source, garment_sources, mesh_sources
 
 #: Objects on the page of pictures.
@@ -130,12 +131,15 @@ def _run(jobs: list[tuple], processes: int, variant: str, advance: Callable[[int
     # The processes are what runs side by side: threads of BLAS would wait for each other, for half the time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Spawned, as a process that has used Dr.Jit must not be forked.
-    with ProcessPoolExecutor(
-        min(processes, len(jobs)),
-        multiprocessing.get_context("spawn"),
-        initializer=_begin,
-        initargs=(variant,),
-    ) as pool:
+    with (
+        told_if_killed(),
+        ProcessPoolExecutor(
+            min(processes, len(jobs)),
+            multiprocessing.get_context("spawn"),
+            initializer=_begin,
+            initargs=(variant,),
+        ) as pool,
+    ):
         futures = {pool.submit(_convert_shard, *job): len(job[1]) for job in jobs}
         try:
             for future in as_completed(futures):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import Any
 
 from ..doctor import ensure_variant
@@ -24,14 +25,20 @@ def in_own_process(work: Callable, *arguments: Any, variant: str | None = None) 
         UserError: also where the process was killed, as for want of memory.
     """
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, context, initializer=_begin, initargs=(variant,)) as pool:
-        try:
-            return pool.submit(work, *arguments).result()
-        except BrokenProcessPool as error:
-            raise UserError(
-                "The process that computes was ended from outside, perhaps for want of memory; "
-                "free some, or ask for less at once."
-            ) from error
+    with told_if_killed(), ProcessPoolExecutor(1, context, initializer=_begin, initargs=(variant,)) as pool:
+        return pool.submit(work, *arguments).result()
+
+
+@contextmanager
+def told_if_killed() -> Iterator[None]:
+    """Raises ``UserError`` where a process of a pool was ended from outside."""
+    try:
+        yield
+    except BrokenProcessPool as error:
+        raise UserError(
+            "A process that computes was ended from outside, perhaps for want of memory; free some, or ask "
+            "for less at once."
+        ) from error
 
 
 def _begin(variant: str | None) -> None:

@@ -89,18 +89,24 @@ def generate(
         known,
         quiet,
     )
-    fields, seconds = sampled_fields(model, request)
+    names = [f"meshes/{index:04d}.{suffix}" for index in range(count)]
+    film = ["interpolation.mp4"] if interpolate is not None else []
+    written = ["fields.npz", "samples.json", "sheet.png", *film, *names]
     output.mkdir(parents=True, exist_ok=True)
     with own_folder(output, "generate") as folder:
+        folder.check_free(written)  # before the work
+        fields, seconds = sampled_fields(model, request)
+        folder.clear()
+        folder.claim(*written)
         return _write(
             folder,
+            names,
             fields,
             [classes[n] if n is not None else "any" for n in numbers],
             seeds,
             back,
             seconds,
-            suffix,
-            film=interpolate is not None,
+            film=bool(film),
             quiet=quiet,
         )
 
@@ -138,21 +144,16 @@ def near_points(points: np.ndarray, side: int, cells: float) -> np.ndarray:
 
 def _write(
     folder: OwnFolder,
+    names: list[str],
     fields: np.ndarray,
     kinds: list[str],
     seeds: list,
     back: np.ndarray,
     seconds: float,
-    suffix: str,
     *,
     film: bool,
     quiet: bool,
 ) -> str:
-    names = [f"meshes/{index:04d}.{suffix}" for index in range(len(fields))]
-    written = ["fields.npz", "samples.json", "sheet.png", *(["interpolation.mp4"] if film else []), *names]
-    folder.check_free(written)
-    folder.clear()
-    folder.claim(*written)
     (folder.path / "meshes").mkdir(exist_ok=True)
     pictures, labels, told = [], [], []
     with Bars(quiet=quiet) as progress:

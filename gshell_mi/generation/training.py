@@ -67,12 +67,8 @@ def train(data_set: Path, output: Path, config: TrainConfig, *, quiet: bool = Tr
     try:
         data = DataSet.open(data_set)
         made = ModelConfig(config.model, config.size, data.side, tuple(data.classes))
-        training = _loaded(data, config, run.device, held_out=False)
-        tests = (
-            _loaded(data, config, run.device, held_out=True)
-            if run.first and any(record.held_out for record in data.records)
-            else None
-        )
+        tested = run.first and any(record.held_out for record in data.records)
+        training, *tests = _loaded(data, config, run.device, *((False, True) if tested else (False,)))
         if not run.first:
             return _Training(config, made, run, None).run(training, None, quiet=True)
         output.mkdir(parents=True, exist_ok=True)
@@ -80,7 +76,9 @@ def train(data_set: Path, output: Path, config: TrainConfig, *, quiet: bool = Tr
             check_same(output, made, config, data)
             folder.claim("model.json", "weights.safetensors", _CHECKPOINT, "log.jsonl")
             write_card(output, made, config, data)
-            return _Training(config, made, run, folder).run(training, tests, quiet=quiet)
+            return _Training(config, made, run, folder).run(
+                training, tests[0] if tests else None, quiet=quiet
+            )
     except torch.OutOfMemoryError as error:
         raise UserError(
             f"The device has not enough memory for batches of {config.batch}; give a smaller "
@@ -90,10 +88,13 @@ def train(data_set: Path, output: Path, config: TrainConfig, *, quiet: bool = Tr
         run.end()
 
 
-def _loaded(data: DataSet, config: TrainConfig, device: torch.device, *, held_out: bool) -> TrainingSet:
-    records, sdf, msdf, _ = data.load(held_out=held_out)
-    kinds = [data.classes.index(record.kind) for record in records]
-    return TrainingSet(sdf, msdf, kinds, mirror=config.mirror and not held_out, device=device)
+def _loaded(data: DataSet, config: TrainConfig, device: torch.device, *splits: bool) -> list[TrainingSet]:
+    """Splits of a set, of which True is what is held out."""
+    found = []
+    for held_out, (records, sdf, msdf, _) in zip(splits, data.load_splits(*splits), strict=True):
+        kinds = [data.classes.index(record.kind) for record in records]
+        found.append(TrainingSet(sdf, msdf, kinds, mirror=config.mirror and not held_out, device=device))
+    return found
 
 
 @dataclass(frozen=True)
@@ -350,7 +351,7 @@ class _Training:
                 raise UserError(
                     f"'{path}' cannot be read ({type(error).__name__}); remove it to train from the start."
                 ) from error
-            self._cut_log()
+        self._cut_log()
         if self.processes.count > 1:
             self._share_state()
 
@@ -407,15 +408,12 @@ class _Training:
             file.write(json.dumps(line) + "\n")
 
     def _cut_log(self) -> None:
-        """Takes out the lines of steps that are taken again."""
+        """Takes out the lines of steps that are taken again, and those that a kill has torn."""
         path = None if self.folder is None else self.folder.path / "log.jsonl"
         if path is None or not path.is_file():
             return
-        lines = [
-            line
-            for line in path.read_text(encoding="utf-8").splitlines()
-            if json.loads(line)["step"] <= self._all.step
-        ]
+        text = path.read_text(encoding="utf-8", errors="replace")
+        lines = [line for line in text.splitlines() if _step_of(line) <= self._all.step]
         with replacing(path) as partial:
             partial.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
 
@@ -440,6 +438,15 @@ class _Training:
             [self.made.classes[k] for k in kinds],
             variant="llvm_ad_rgb",
         )
+
+
+def _step_of(line: str) -> float:
+    """The step that a line of the log tells of; infinite if it is damaged."""
+    try:
+        step = json.loads(line)["step"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return math.inf
+    return step if isinstance(step, int) else math.inf
 
 
 def _halved(value: torch.Tensor) -> torch.Tensor:

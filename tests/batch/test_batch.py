@@ -9,11 +9,13 @@ from types import SimpleNamespace
 
 import pytest
 
+from gshell_mi.batch import work
 from gshell_mi.batch.__main__ import main
-from gshell_mi.batch.batch import run_batch
+from gshell_mi.batch.batch import _page, run_batch
 from gshell_mi.batch.jobs import Job, read_jobs
 from gshell_mi.batch.work import finished, run_job
 from gshell_mi.errors import UserError
+from gshell_mi.own_folder import OwnFolder
 
 
 def write_jobs(path, *jobs):
@@ -80,6 +82,66 @@ def test_results_go_to_any_storage_and_only_good_ends_count(tmp_path):
     assert finished(f"file://{tmp_path}/there", [Job("a", "turntable", ("other",))]) == {}
 
 
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {"seconds": "<b>"},
+        {"seconds": None},
+        {"told": 3},
+        {"name": "b"},
+        {"psnr": "high"},
+        {"psnr": float("nan")},
+    ],
+)
+def test_a_damaged_note_of_a_job_is_no_good_end(spoilt, tmp_path):
+    pytest.importorskip("fsspec")
+    job = Job("a", "turntable", ("missing",))
+    good = {"name": "a", "job": ["turntable", "missing"], "status": "done"}
+    good |= {"code": 0, "seconds": 1.0, "told": "", "psnr": 30.0}
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "job.json").write_text(json.dumps(good))
+    assert finished(str(tmp_path), [job]) == {"a": good}
+    (tmp_path / "a" / "job.json").write_text(json.dumps(good | spoilt))
+    assert finished(str(tmp_path), [job]) == {}
+
+
+def test_no_cell_of_the_page_is_taken_for_html():
+    cells = ("name", "status", "psnr", "seconds", "told")
+    assert "<b>" not in _page([dict.fromkeys(cells, "'<b>")])
+
+
+class FakeFits:
+    """Stands for the processes of fits: each leaves a checkpoint and is cut off."""
+
+    def __init__(self):
+        self.arguments: list[list[str]] = []
+
+    def run(self, command, **_):
+        self.arguments.append(command[3:])
+        output = work._output(command)
+        output.mkdir(parents=True, exist_ok=True)
+        (output / "checkpoint.npz").touch()
+        OwnFolder(output, "fit").write_mark({"checkpoint.npz"})
+        return SimpleNamespace(returncode=1, stderr="")
+
+
+@pytest.mark.parametrize("given", [(), ("-o", "{out}"), ("-o", "{out}/fit"), ("--output={out}/fit",)])
+def test_a_fit_goes_on_wherever_it_writes_and_another_one_takes_its_place(given, tmp_path, monkeypatch):
+    fits = FakeFits()
+    monkeypatch.setattr(work, "subprocess", SimpleNamespace(run=fits.run, PIPE=None, DEVNULL=None))
+    for scene in ("a.xml", "a.xml", "b.xml", "b.xml"):
+        run_job(Job("a", "fit", (scene, *given)), str(tmp_path))
+    assert [words[-1] for words in fits.arguments] == ["--overwrite", "--resume"] * 2
+
+
+def test_a_fit_elsewhere_is_never_replaced(tmp_path, monkeypatch):
+    fits = FakeFits()
+    monkeypatch.setattr(work, "subprocess", SimpleNamespace(run=fits.run, PIPE=None, DEVNULL=None))
+    given = ("a.xml", "--targets", "{out}", "-o", str(tmp_path / "mine"))
+    run_job(Job("a", "fit", given), str(tmp_path / "jobs"))
+    assert fits.arguments[0][-2:] == ["-o", str(tmp_path / "mine")]
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its parent's end")
 def test_a_killed_worker_leaves_no_job_behind():
     script = (
@@ -121,7 +183,9 @@ class FakeRay:
 
     shutdown = init
 
-    def remote(self, **_):
+    def remote(self, *, max_retries):
+        assert max_retries == 0  # the batch counts tries itself
+
         class Task:
             def __init__(self, work):
                 self.work = work

@@ -43,6 +43,17 @@ def test_units_do_not_matter():
     assert found.area == pytest.approx(BOWL.area)
 
 
+@pytest.mark.parametrize("size", [1e-7, 1e6])
+def test_a_mesh_in_its_own_units_is_welded_by_its_size(size):
+    """Each face has its own vertices, which agree in nine digits."""
+    soup = BOWL.triangles.reshape(-1, 3)
+    soup = size * (soup + 1e-9 * np.random.default_rng(0).uniform(-1, 1, soup.shape))
+    found = loaded_mesh(mesh(np.arange(len(soup)).reshape(-1, 3), soup), "mesh")
+    assert found.area == pytest.approx(size**2 * BOWL.area)
+    assert len(found.faces) == len(BOWL.faces)
+    assert len(found.vertices) < 1.05 * len(np.unique(BOWL.faces))
+
+
 def test_a_mirrored_transform_keeps_the_outside():
     found = loaded_mesh(BALL, "mesh", np.diag([-1.0, 1.0, 1.0, 1.0]))
     assert found.volume == pytest.approx(BALL.volume)

@@ -1,6 +1,8 @@
 """Data sets: what is in them, what is refused, and what a kill costs."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import trimesh
 
 from gshell_mi.dataset.__main__ import main
 from gshell_mi.errors import UserError
-from gshell_mi.generation import making
+from gshell_mi.generation import data_set, making
 from gshell_mi.generation.data_set import DataSet
 from gshell_mi.generation.making import make_data_set
 from gshell_mi.generation.sources import garment_sources, mesh_sources
@@ -70,6 +72,17 @@ def test_the_split_is_by_name_and_complete(made):
     assert not split[0] & split[1] and len(split[0] | split[1]) == 8
 
 
+def test_both_splits_take_one_pass(made, monkeypatch):
+    data, read, of_file = DataSet.open(made), [], data_set.read_shard
+    monkeypatch.setattr(data_set, "read_shard", lambda path, side: read.append(path) or of_file(path, side))
+    both = data.load_splits(False, True)
+    assert read == [data.shard_path(number) for number in range(data.config["shards"])]
+    for split, held_out in zip(both, (False, True), strict=True):
+        alone = data.load(held_out=held_out)
+        assert split.records == alone.records
+        assert all(np.array_equal(a, b) for a, b in zip(split[1:], alone[1:], strict=True))
+
+
 def test_what_is_refused_is_listed_with_the_reason(made):
     rejected = json.loads((made / "statistics.json").read_text())["rejected"]
     reasons = {row["name"]: row["reason"] for row in rejected}
@@ -112,6 +125,16 @@ def test_a_damaged_shard_is_told(meshes, tmp_path):
         DataSet.open(tmp_path / "set").load(held_out=False)
 
 
+def test_a_process_that_was_killed_is_told(monkeypatch):
+    class Broken(ThreadPoolExecutor):
+        def submit(self, *_):
+            raise BrokenProcessPool
+
+    monkeypatch.setattr(making, "ProcessPoolExecutor", lambda count, *_, **__: Broken(count))
+    with pytest.raises(UserError, match="was ended from outside, perhaps for want of memory"):
+        making._run([(None, [])] * 2, 2, "llvm_ad_rgb", lambda _: None)
+
+
 def test_another_set_in_the_folder_is_left_alone(meshes, made):
     with pytest.raises(UserError, match="holds a data set of other sources or settings"):
         make_data_set(made, [meshes], side=24)
@@ -128,6 +151,7 @@ def test_another_set_in_the_folder_is_left_alone(meshes, made):
         (["-o", "{tmp}/set", "--garments", "3", "--side", "20"], "--side must be a multiple of 8"),
         (["-o", "{tmp}/set", "--garments", "3", "--held-out", "1"], "--held-out must be at least 0"),
         (["-o", "{tmp}/set", "--garments", "3", "--processes", "0"], "--processes must be at least 1"),
+        (["-o", "{tmp}/set", "--garments", "3", "--seed", "-1"], "--seed must not be negative, but is -1"),
         (["-o", "{tmp}/set", "--garments", "1000000000000"], "--garments must be at most"),
         (["-o", "{tmp}/set", "--garments", "3", "--max-chamfer", "nan"], "--max-chamfer must be more than 0"),
     ],

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gshell_mi.errors import UserError
-from gshell_mi.generation.garments import CLASSES, garment
+from gshell_mi.generation.garments import CLASSES, draw, garment
 from gshell_mi.generation.garments.kinds import KINDS
 from gshell_mi.topology import topology
 
@@ -41,6 +41,14 @@ def test_torsos_lose_loops_as_their_style_says():
     loops = {KINDS["top"].loops(style) for style in styles}
     assert loops == {2, 3, 4}
     assert all(KINDS["top"].loops(style) == 2 for style in styles if style["strapless"])
+
+
+def test_a_garment_that_never_comes_out_right_is_told(monkeypatch):
+    monkeypatch.setattr(draw, "_sewn", lambda *_: None)
+    with pytest.raises(
+        UserError, match="no hat of seed 3 came out right in 20 attempts; choose another seed"
+    ):
+        garment("hat", 3)
 
 
 def test_an_unknown_class_is_told():

@@ -221,20 +221,10 @@ def test_scores_of_what_are_no_samples_are_told(tiny_set, tmp_path, capsys):
     assert "holds no samples; make some with" in capsys.readouterr().err
 
 
-def test_a_view_sees_the_side_of_a_ball_that_faces_it(tmp_path):
-    from gshell_mi.generation.unseen import seen_points
-
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    world = trimesh.Trimesh(2 * ball.vertices + [1, 0, 0], ball.faces)
-    world.export(tmp_path / "mesh.ply")
-    (tmp_path / "scene.xml").write_text("""<scene version="3.0.0"><integrator type="path"/>
-<sensor type="perspective" id="view_000"><float name="fov" value="60"/>
-<transform name="to_world"><lookat origin="1,0,20" target="1,0,0" up="0,1,0"/></transform>
-<film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film></sensor>
-<emitter type="constant" id="light"/><shape type="ply" id="subject"><string name="filename" value="mesh.ply"/>
-</shape></scene>""")
-    back = np.diag([2.0, 2, 2, 1])
-    back[0, 3] = 1
-    points = seen_points(tmp_path, ball, back)
-    assert points[points[:, 2] > 0.2, 3].mean() > 0.99
-    assert points[points[:, 2] < 0.0, 3].mean() < 0.01
+def test_a_foreign_file_is_told_before_anything_is_sampled(
+    tiny_model, tmp_path, variant, monkeypatch, capsys
+):
+    monkeypatch.setattr("gshell_mi.generation.sampled.sampled_fields", None)
+    (tmp_path / "sheet.png").write_text("mine")
+    assert main([str(tiny_model), "-o", str(tmp_path), "--quiet", "--variant", variant]) == 2
+    assert "sheet.png' is in the way" in capsys.readouterr().err

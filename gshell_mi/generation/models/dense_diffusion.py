@@ -96,7 +96,7 @@ class DenseDiffusion(nn.Module):
     def sample(self, steering: Steering, told: Callable[[], None] = lambda: None) -> np.ndarray:
         """(B, 2, N, N, N) float32 truncated fields; ``told`` is called ``steering.steps`` times."""
         device, side = self.signal.device, self.config.side
-        noise = steering.noise((2, side, side, side), 0).to(device)
+        noise = steering.noise((2, side, side, side)).to(device)
         kinds = torch.tensor(steering.kinds, device=device)
         nobody = torch.full_like(kinds, len(self.config.classes))
         guided = steering.guidance != 1 and bool((kinds != nobody).any())

@@ -7,18 +7,17 @@ are due to Rombach et al. (CVPR 2022).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor, nn
 
 from ..encodings import BLOCK
 from ..model_config import ModelConfig
 from .autoencoder import Autoencoder
 from .coded_set import CodedSet
+from .flow import Velocity, blended, guided, integrated, start_of
 from .steering import Steering
 from .training_set import TrainingSet
 from .transformer import TokenTransformer
@@ -27,9 +26,7 @@ from .transformer import TokenTransformer
 _DROPOUT = 0.1
 #: Objects per step of the flow, for each of the autoencoder's, which has hundreds of times the work with one.
 _MORE_LATENTS = 8
-#: From what is held to what is made it changes over so many cells.
-_BLEND_CELLS = 2.0
-#: Fields are encoded and decoded so many at once.
+#: Fields are encoded so many at once.
 _CHUNK = 16
 
 
@@ -121,74 +118,27 @@ class LatentFlow(nn.Module):
             told: called after each of ``steering.steps``.
         """
         device = self.autoencoder.mean.device
-        noise = steering.noise((self.channels, *3 * (self.per_side,)), 0).to(device)
-        start = goal = held = kept = None
-        lost: Tensor | float = 0.0
-        if steering.start is not None:
-            start = torch.from_numpy(np.ascontiguousarray(steering.start, np.float32)).to(device)[None]
-            goal = self.autoencoder.encode(start)
-            lost = start - self.autoencoder.decode(goal)
-            kept = 1 - steering.strength
-        if steering.known is not None:
-            if goal is None:
-                raise ValueError("nothing is known where there is no start")
-            held = self._tokens(self._whole_blocks(steering.known, device).expand_as(goal)) > 0
-            away = ndimage.distance_transform_edt(steering.known)
-            kept = torch.from_numpy(np.clip(away / _BLEND_CELLS, 0, 1).astype(np.float32)).to(device)
-        tokens = self._flow(
-            self._tokens(noise), steering, None if goal is None else self._tokens(goal), held, told
+        noise = steering.noise((self.channels, *3 * (self.per_side,))).to(device)
+        start = start_of(steering, device)
+        goal = None if start is None else self.autoencoder.encode(start)
+        tokens = integrated(
+            guided(self.flow, steering, len(self.config.classes), device),
+            self._tokens(noise),
+            None if goal is None else self._tokens(goal),
+            steering,
+            told,
+            self._holding(noise, goal, steering.known),
         )
-        found = []
-        for latents in self._latents(tokens).split(_CHUNK):
-            fields = self.autoencoder.decode(latents)
-            if start is not None and kept is not None:
-                # What is held is held exactly; else what was lost is given back as far as all is kept.
-                fields = fields + kept * (start - fields if held is not None else lost)
-            found.append(fields.clamp(-1, 1).cpu().numpy())
-        return np.concatenate(found)
+        return blended(self.autoencoder.decode, self._latents(tokens), steering, start, goal)
 
-    def _flow(
-        self,
-        noise: Tensor,
-        steering: Steering,
-        goal: Tensor | None,
-        held: Tensor | None,
-        told: Callable[[], None],
-    ) -> Tensor:
-        """From noise to data by Heun's method, the last step by Euler's.
-
-        Args:
-            goal: data to begin near of, or whose ``held`` parts stay.
-        """
-        kinds = torch.tensor(steering.kinds, device=noise.device)
-        nobody = torch.full_like(kinds, len(self.config.classes))
-        guided = steering.guidance != 1 and bool((kinds != nobody).any())
-        first = 0.0 if goal is None else 1 - steering.strength
-        times = torch.linspace(first, 1, steering.steps + 1).tolist()
-
-        def velocity(x: Tensor, t: float) -> Tensor:
-            at = torch.full((len(x),), t, device=x.device)
-            if not guided:
-                return self.flow(x, at, kinds).float()
-            both = self.flow(x.repeat(2, 1, 1), at.repeat(2), torch.cat([kinds, nobody])).float()
-            with_kind, without = both.chunk(2)
-            return without + steering.guidance * (with_kind - without)
-
-        def hold(x: Tensor, t: float) -> Tensor:
-            if held is None or goal is None:
-                return x
-            return torch.where(held, (1 - t) * noise + t * goal, x)
-
-        x = noise if goal is None else (1 - first) * noise + first * goal
-        for now, then in itertools.pairwise(times):
-            x = hold(x, now)
-            if now < 1:
-                v = velocity(x, now)
-                if then < 1:
-                    v = (v + velocity(x + (then - now) * v, then)) / 2
-                x = x + (then - now) * v
-            told()
-        return hold(x, 1.0)
+    def _holding(self, noise: Tensor, goal: Tensor | None, known: np.ndarray | None) -> Velocity:
+        """What puts the blocks that are known everywhere into tokens at a time, on the way from noise to
+        ``goal``."""
+        if known is None or goal is None:
+            return lambda x, t: x
+        held = self._tokens(self._whole_blocks(known, noise.device).expand_as(goal)) > 0
+        begin, end = self._tokens(noise), self._tokens(goal)
+        return lambda x, t: torch.where(held, (1 - t) * begin + t * end, x)
 
     # -- latents and tokens ---------------------------------------------------------------------------
 

@@ -7,7 +7,6 @@ matching is that of Lipman et al. (ICLR 2023), with straight paths from noise at
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 from ..fields import TRUNCATION_CELLS
 from ..model_config import ModelConfig
 from .coded_set import CodedSet
+from .flow import Velocity, blended, guided, integrated, start_of
 from .perceptron import Perceptron
 from .steering import Steering
 from .training_set import TrainingSet
@@ -31,8 +31,6 @@ _MORE = 2
 #: Caps are pushed outwards by so many cells per cell beyond a rim, from the second number on to the third:
 #: a sheet close to its cap would be a thin wedge, which sums of shapes tear. Where a cap is nobody sees.
 _PUSH, _PUSHED_FROM, _PUSHED_TO = 2.0, 0.3, 3.3
-#: From what is held to what is made it changes over so many cells.
-_BLEND_CELLS = 2.0
 #: Trust in what is known of a shape: this variance per node, by the truncation.
 _KNOWN_VARIANCE = 1e-4
 #: Levels of a stored component.
@@ -142,8 +140,7 @@ class ShapeFlow(nn.Module):
 
     def coded(self, fields: Tensor) -> tuple[Tensor, int]:
         """Fields after a way through the components, and the numbers of each."""
-        points = (self._to_nodes(fields) - self.mean) @ self._inverse()
-        return self._fields(points).clamp(-1, 1), self.components
+        return self._fields(self._coded(fields)).clamp(-1, 1), self.components
 
     # -- sampling -------------------------------------------------------------------------------------
 
@@ -157,68 +154,14 @@ class ShapeFlow(nn.Module):
             told: called after each of ``steering.steps``.
         """
         device = self.mean.device
-        noise = steering.noise((self.components,), 0).to(device)
-        start = goal = kept = toward = None
-        lost: Tensor | float = 0.0
-        if steering.start is not None:
-            start = torch.from_numpy(np.ascontiguousarray(steering.start, np.float32)).to(device)[None]
-            goal = (self._to_nodes(start) - self.mean) @ self._inverse()
-            lost = start - self._fields(goal)
-            kept = 1 - steering.strength
-        if steering.known is not None:
-            if start is None:
-                raise ValueError("nothing is known where there is no start")
-            toward = self._conditioned(start, steering.known)
-            away = ndimage.distance_transform_edt(steering.known)
-            kept = torch.from_numpy(np.clip(away / _BLEND_CELLS, 0, 1).astype(np.float32)).to(device)
-        points = self._flow(noise, steering, goal, toward, told)
-        found = []
-        for part in points.split(_CHUNK):
-            fields = self._fields(part)
-            if start is not None and kept is not None:
-                # What is held is held exactly; else what was lost is given back as far as all is kept.
-                fields = fields + kept * (start - fields if toward is not None else lost)
-            found.append(fields.clamp(-1, 1).cpu().numpy())
-        return np.concatenate(found)
-
-    def _flow(
-        self,
-        noise: Tensor,
-        steering: Steering,
-        goal: Tensor | None,
-        toward: Callable[[Tensor], Tensor] | None,
-        told: Callable[[], None],
-    ) -> Tensor:
-        """From noise to data by Heun's method, the last step by Euler's.
-
-        Args:
-            goal: data to begin near of.
-            toward: what is known makes of an expected shape.
-        """
-        kinds = torch.tensor(steering.kinds, device=noise.device)
-        nobody = torch.full_like(kinds, len(self.config.classes))
-        guided = steering.guidance != 1 and bool((kinds != nobody).any())
-        first = 0.0 if goal is None else 1 - steering.strength
-
-        def velocity(x: Tensor, t: float) -> Tensor:
-            at = torch.full((len(x),), t, device=x.device)
-            v = self.flow(x, at, kinds).float()
-            if guided:
-                without = self.flow(x, at, nobody).float()
-                v = without + steering.guidance * (v - without)
-            if toward is not None:
-                v = (toward(x + (1 - t) * v) - x) / (1 - t)
-            return v
-
-        x = noise if goal is None else (1 - first) * noise + first * goal
-        for now, then in itertools.pairwise(torch.linspace(first, 1, steering.steps + 1).tolist()):
-            if now < 1:
-                v = velocity(x, now)
-                if then < 1:
-                    v = (v + velocity(x + (then - now) * v, then)) / 2
-                x = x + (then - now) * v
-            told()
-        return x
+        noise = steering.noise((self.components,)).to(device)
+        velocity = guided(self.flow, steering, len(self.config.classes), device)
+        start = start_of(steering, device)
+        goal = None if start is None else self._coded(start)
+        if start is not None and steering.known is not None:
+            velocity = _toward(self._conditioned(start, steering.known), velocity)
+        points = integrated(velocity, noise, goal, steering, told)
+        return blended(self._fields, points, steering, start, goal)
 
     def _conditioned(self, start: Tensor, known: np.ndarray) -> Callable[[Tensor], Tensor]:
         """Points moved so that their shapes have the known nodes of ``start``, as far as that is likely where
@@ -243,6 +186,10 @@ class ShapeFlow(nn.Module):
         pushed = (sdf - _PUSH / TRUNCATION_CELLS * beyond).clamp(min=-1)
         return self._along_axes(self.fit, torch.stack([pushed, msdf], dim=1)).flatten(1)
 
+    def _coded(self, fields: Tensor) -> Tensor:
+        """(B, 2, N, N, N) fields as (B, components) points."""
+        return (self._to_nodes(fields) - self.mean) @ self._inverse()
+
     def _fields(self, points: Tensor) -> Tensor:
         nodes = points @ self._basis() + self.mean
         return self._along_axes(self.spline, nodes.view(-1, 2, *3 * (self.nodes,)))
@@ -252,6 +199,11 @@ class ShapeFlow(nn.Module):
         for _ in range(3):  # each turn the last axis becomes the first of the three
             values = (values @ matrix.T).permute(0, 1, 4, 2, 3)
         return values.contiguous()
+
+
+def _toward(conditioned: Callable[[Tensor], Tensor], velocity: Velocity) -> Velocity:
+    """A velocity that leads to what is known, of what it would lead to."""
+    return lambda x, t: (conditioned(x + (1 - t) * velocity(x, t)) - x) / (1 - t)
 
 
 def leading_eigenvectors(matrix: np.ndarray, count: int) -> np.ndarray:

@@ -27,7 +27,7 @@ class Steering:
     known: np.ndarray | None = None
     """(N, N, N) bool: where ``start`` is held fixed."""
 
-    def noise(self, shape: tuple[int, ...], stream: int) -> torch.Tensor:
+    def noise(self, shape: tuple[int, ...]) -> torch.Tensor:
         """(B, *shape) normal noise on the host: the same for the same seeds, whatever else is in the batch.
 
         Between two seeds it turns from one to the other, so that it stays normal.
@@ -35,9 +35,7 @@ class Steering:
         found = []
         for first, second, part in self.seeds:
             a, b = (
-                torch.from_numpy(
-                    np.random.default_rng([seed, stream]).standard_normal(shape, dtype=np.float32)
-                )
+                torch.from_numpy(np.random.default_rng(seed).standard_normal(shape, dtype=np.float32))
                 for seed in (first, second)
             )
             angle = part * torch.pi / 2
