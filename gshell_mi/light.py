@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import drjit as dr
@@ -15,7 +16,7 @@ from .compat import environment_data, environment_radiance
 MINIMUM_RADIANCE = 1e-4
 
 
-def turns_with_camera(sensors: list[mi.Sensor]) -> np.ndarray:
+def turns_with_camera(sensors: Sequence[mi.Sensor]) -> np.ndarray:
     """Rotations of a light that is fixed to the camera, as where an object turns on a turntable.
 
     Returns:
@@ -36,6 +37,14 @@ def turned(to_world: mi.ScalarTransform4f, turn: np.ndarray) -> mi.Transform4f:
     return mi.Transform4f(mi.ScalarTransform4f(rotation) @ to_world)
 
 
+def turned_for(
+    to_world: mi.ScalarTransform4f, first: mi.Sensor, sensors: Sequence[mi.Sensor]
+) -> list[mi.Transform4f]:
+    """For each sensor ``to_world`` of an emitter that turns with the camera, and is stored as the ``first``
+    sensor has it."""
+    return [turned(to_world, turn) for turn in turns_with_camera([first, *sensors])[1:]]
+
+
 class EnvironmentLight:
     """A latitude-longitude environment map whose radiance is the exponential of its parameter.
 
@@ -52,7 +61,7 @@ class EnvironmentLight:
     def __init__(self, radiance: np.ndarray, to_world: mi.ScalarTransform4f | None = None):
         floor = np.maximum(radiance, MINIMUM_RADIANCE).astype(np.float32)
         self.log_radiance = mi.TensorXf(np.log(floor))
-        self._to_world = to_world or mi.ScalarTransform4f()
+        self.to_world = to_world or mi.ScalarTransform4f()
 
     @classmethod
     def uniform(cls, height: int, radiance: float) -> EnvironmentLight:
@@ -81,7 +90,7 @@ class EnvironmentLight:
 
     def turned(self, turn: np.ndarray) -> mi.Transform4f:
         """``to_world`` of the emitter where the light has turned, by a rotation (3, 3)."""
-        return turned(self._to_world, turn)
+        return turned(self.to_world, turn)
 
     @cached_property
     def solid_angles(self) -> mi.TensorXf:
@@ -100,7 +109,7 @@ class EnvironmentLight:
             {
                 "type": "envmap",
                 "id": "light",
-                "to_world": self._to_world,
+                "to_world": self.to_world,
                 "bitmap": mi.Bitmap(dr.detach(self.radiance)),
                 "mis_compensation": False,
             }

@@ -16,7 +16,7 @@ from ..export.fitted_scene import load_fitted_scene
 from ..files import name_trouble
 from ..images import over_white, write_png
 from ..json_files import read_json_object
-from ..light import turned, turns_with_camera
+from ..light import turned_for
 from ..own_folder import TAG, check_own_file
 from ..scene_files import load_scene
 from ..targets import load_target
@@ -105,8 +105,7 @@ def compare_fit(
     lights = []
     if metrics.get("light_frame") == "camera" and not envmap:
         to_world = mi.ScalarTransform4f(np.array(parameters["light.to_world"].matrix).reshape(4, 4))
-        turns = turns_with_camera([scene.sensors()[0], *cameras])[1:]
-        lights = [turned(to_world, turn) for turn in turns]
+        lights = turned_for(to_world, scene.sensors()[0], cameras)
     for number, (camera, reference) in enumerate(zip(cameras, references, strict=True)):
         if lights:
             parameters["light.to_world"] = lights[number]

@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import __version__
 from ..files import replacing
-from ..light import turns_with_camera
+from ..light import turned_for
 from ..material import attributes_of
 from ..own_folder import OwnFolder
 from ..subdivision import subdivided
@@ -77,8 +77,8 @@ def export_fit(
 
     def scored(folder: str | None, group: Sequence[View]) -> dict:
         # The first training view has the light as it is stored.
-        turns = turns_with_camera([given.sensors[0], *(view.sensor for view in group)])[1:]
-        lights = [light.turned(turn) for turn in turns] if light and light_turns else []
+        sensors = [view.sensor for view in group]
+        lights = turned_for(light.to_world, given.sensors[0], sensors) if light and light_turns else []
         exposed = gains[chosen] if folder == TRAINING and gains is not None else ()
         return write_views(output, folder, group, lights, exposed)
 

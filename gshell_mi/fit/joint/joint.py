@@ -81,14 +81,13 @@ class JointStage:
         self.parameters = mi.traverse(self.scene)
         self._turns = turns if light else None
         #: Per view the share of each pixel that is known, None if that is all. The rest is black in images.
-        known = [
+        self._known = [
             None if target.is_known else mi.TensorXf(np.asarray(target.known)[..., None])
             for target in given.targets
         ]
-        self._known = known
         self._targets = [
             mi.TensorXf(target.rgba) if share is None else mi.TensorXf(target.rgba) * share
-            for target, share in zip(given.targets, known, strict=True)
+            for target, share in zip(given.targets, self._known, strict=True)
         ]
         self._sees_masks = all(target.has_alpha for target in given.targets) and not config.geometry_only
         if config.geometry_only:
