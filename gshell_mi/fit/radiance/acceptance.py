@@ -9,7 +9,7 @@ import numpy as np
 
 from ...fields.smoothing import MeshDiffusion
 from ...template.caps import Recesses
-from ...topology import equal_patches, lobes, mesh_components, patch_sizes
+from ...topology import equal_patches, lobes, mesh_components, mesh_edges, patch_sizes, spread
 from ..judge import Judge, places_of
 from .shown import Part, Shown
 
@@ -35,12 +35,16 @@ def close_rejected(
     where its own vertices speak against it, if that is not most of it, and judged again: an opening may run
     on into gloss beside it.
 
+    What a justified opening grows by adds no loop: it only moves a rim, and of two rims the one counts that
+    explains more, however little. Of the gilded hat's lid, pieces remained at its mouth whose opening gains
+    0.14 to 0.35, 0.7 to 1.4 standard errors; what is surface in truth there loses 0.4 to 2.7.
+
     Args:
         logits: (V,) opacity logits; surface where positive.
         template: what is opened, closed.
         judge: of the fit.
         before: the template without these openings.
-        given: (V,) openings that have been justified; default: none.
+        given: (V,) openings that have been justified, which may grow; default: none.
 
     Returns:
         (V,) logits, those of rejected openings negated.
@@ -53,12 +57,14 @@ def close_rejected(
     if (opened | given).all():
         # Nothing at all explains no image.
         return np.where(given, logits, -logits)
+    beside = spread(given, mesh_edges(faces)[0])
     kept, trimmed, closed = opened, np.zeros_like(opened), 0
     for closing in reversed(range(_CLOSINGS)):
         place = places_of(kept, lobes(kept, faces))
         after = template.part(np.where(kept | given, -np.abs(logits), np.abs(logits)))
         verdict = replace(judge.compare(before, after, place), rejected=closed)
-        worst = ~verdict.accepted
+        grows = np.bincount(place[kept], beside[kept]) > 0
+        worst = ~(verdict.accepted | grows & np.isfinite(verdict.noise) & (verdict.gain > 0))
         # The worst first; all where none is worse but some are not surely better, and in the last round.
         if closing:
             loss = np.where(worst, np.maximum(-verdict.gain, 0), 0)

@@ -40,6 +40,19 @@ def test_a_gain_counts_by_its_noise_alone(ball, noise, stays):
     np.testing.assert_array_equal(result <= 0, up & stays)
 
 
+@pytest.mark.parametrize(
+    ("after", "noise", "grows"), [(0.9, 0.5, True), (1.1, 0.5, False), (0.9, np.inf, False)]
+)
+def test_a_justified_opening_grows_by_what_explains_more(ball, after, noise, grows):
+    """Its rim only moves: no loop is added, and a gain of a fifth of a standard error counts."""
+    up, wide, apart = cap(ball, [0, 0, 1], 0.1), cap(ball, [0, 0, 1], 0.2), cap(ball, [0, 0, -1], 0.1)
+    judge = ScriptedJudge(len(ball.vertices), lambda opaque: np.where(opaque, 1.0, after), noise=noise)
+    template = judge.shown((ball.vertices, ball.faces))
+    logits = np.where(wide | apart, -1.0, 2.0)
+    result = close_rejected(logits, template, judge, template.part(np.where(up, -1.0, 1.0)), up)
+    np.testing.assert_array_equal(result <= 0, wide if grows else up)
+
+
 def test_the_error_counts_per_opening_not_per_vertex(ball):
     """Half of an opening's vertices may get worse if the other half gains more."""
     up = cap(ball, [0, 0, 1], 0.1)
