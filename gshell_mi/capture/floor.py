@@ -135,7 +135,8 @@ def _patterned(texture: np.ndarray, noise: float) -> np.ndarray:
     """
     values, area = np.nan_to_num(texture), (_AREA, _AREA, 0)
     fine = values - ndimage.uniform_filter(values, area)
-    spread = np.sqrt(ndimage.uniform_filter(fine**2, area)).max(axis=-1)
+    # The filter's running sums can end a little below 0.
+    spread = np.sqrt(np.maximum(ndimage.uniform_filter(fine**2, area), 0)).max(axis=-1)
     # Where a plain area ends there is a contrast, too.
     return ndimage.minimum_filter(spread > _PATTERN * noise, _AREA)
 
