@@ -68,11 +68,12 @@ def main(arguments: list[str] | None = None) -> int:
     )
 
 
-def _effort(words: list[str]) -> str:
+def _effort(words: list[str]) -> Effort:
     """The effort that a command names; what is none is told of when the words are parsed."""
     named = [following for word, following in itertools.pairwise([*words, ""]) if word == "--effort"]
     named += [word.removeprefix("--effort=") for word in words if word.startswith("--effort=")]
-    return named[-1] if named and named[-1] in EFFORTS else "normal"
+    efforts: dict[str, Effort] = {effort: effort for effort in EFFORTS}
+    return efforts.get(named[-1] if named else "", "normal")
 
 
 def _fit(given: _Arguments) -> None:

@@ -23,7 +23,7 @@ from ..scene_inputs import scene_inputs
 from .bookkeeping.checkpoint import Checkpoint
 from .bookkeeping.fingerprint import check_fingerprint, fingerprint
 from .bookkeeping.observer import Observer
-from .config import EFFORTS, FitConfig, default_output
+from .config import EFFORTS, Effort, FitConfig, default_output
 from .fitted import Fitted
 from .joint.depth import check_depth
 from .lattices import Lattices
@@ -184,10 +184,10 @@ def _check_settings(before: dict[str, Any], now: dict[str, Any]) -> None:
     )
 
 
-def _effort_of(settings: dict[str, Any]) -> str:
+def _effort_of(settings: dict[str, Any]) -> Effort:
     """The effort whose settings these are, or nearly are."""
 
-    def differing(effort: str) -> int:
+    def differing(effort: Effort) -> int:
         return sum(settings.get(name) != value for name, value in EFFORTS[effort].settings().items())
 
     return min(EFFORTS, key=differing)

@@ -212,7 +212,7 @@ _THOROUGH = {
 }
 
 #: The settings of each effort.
-EFFORTS: dict[str, FitConfig] = {
+EFFORTS: dict[Effort, FitConfig] = {
     "preview": FitConfig().changed(_PREVIEW),
     "normal": FitConfig(),
     "thorough": FitConfig().changed(_THOROUGH),

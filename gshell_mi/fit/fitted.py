@@ -64,8 +64,8 @@ class Fitted:
             warn: called with every warning.
         """
         subject = fit.scene.subject
-        arrays = [mesh.to_numpy()[:2] for mesh in (subject.surface, subject.template())]
-        found = diagnose(*arrays, fit.views, subject.cell_size)
+        surface, template = (mesh.to_numpy()[:2] for mesh in (subject.surface, subject.template()))
+        found = diagnose(surface, template, fit.views, subject.cell_size)
         for warning in found.warnings():
             warn(warning)
         metrics = {"diagnostics": dataclasses.asdict(found)}

@@ -46,7 +46,9 @@ class Seen:
     light: np.float32
 
     @classmethod
-    def on(cls, lattice: Lattice, template: SurfaceMesh, radiance: np.ndarray, light: np.float32) -> Seen:
+    def on(
+        cls, lattice: Lattice | BlockLattice, template: SurfaceMesh, radiance: np.ndarray, light: np.float32
+    ) -> Seen:
         """From (V, 3) radiance of a template's vertices."""
         spread, known = splat_to_lattice(mi.Float(radiance.ravel()), template, lattice)
         return cls(spread.numpy().reshape(-1, 3), known.numpy(), light)
@@ -109,6 +111,18 @@ class Surface:
     ignored: np.ndarray | None = None
     poses: np.ndarray | None = None
     light_turns: np.ndarray | None = None
+
+    @property
+    def sight(self) -> Seen:
+        """What was seen, for the stages after the one that looks first."""
+        assert self.seen is not None, "something was looked at"
+        return self.seen
+
+    @property
+    def hull_distance(self) -> np.ndarray:
+        """(n,) signed distance of the hull, for the stages that follow it."""
+        assert self.hull is not None, "it comes from a hull"
+        return self.hull
 
     @property
     def lattice(self) -> Lattice | BlockLattice:

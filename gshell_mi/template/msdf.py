@@ -82,7 +82,9 @@ def reopened(
     return np.where(near, scale * signs, values), near
 
 
-def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: Lattice) -> mi.Float:
+def msdf_from_template(
+    logits: np.ndarray, template: SurfaceMesh, lattice: Lattice | BlockLattice
+) -> mi.Float:
     """ν at the lattice vertices such that its interpolation on the template follows ``logits``.
 
     The scale is about that of a distance: one cell per logit; where the template is far away, 1 cell.
@@ -92,7 +94,9 @@ def msdf_from_template(logits: np.ndarray, template: SurfaceMesh, lattice: Latti
     return dr.select(known, msdf, 1) * lattice.spacing
 
 
-def splat_to_lattice(values: mi.Float, template: SurfaceMesh, lattice: Lattice) -> tuple[mi.Float, mi.Bool]:
+def splat_to_lattice(
+    values: mi.Float, template: SurfaceMesh, lattice: Lattice | BlockLattice
+) -> tuple[mi.Float, mi.Bool]:
     """Turns values at the template's vertices, one or three channels, into a lattice field.
 
     Each lattice vertex takes the mean of the template vertices on its edges, weighted as they

@@ -42,8 +42,10 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
     subject, lattice, min_area = fit.scene.subject, surface.lattice, fit.config.topology.min_area
     shape = (lattice.stride,) * 3
     opacity, seen = opacity_and_visibility(volume, surface, subject.to_world)
-    in_cells = (field.reshape(shape) / lattice.spacing for field in (surface.hull, surface.fields.msdf))
-    distance = hollows(*in_cells, opacity, seen)
+    hull, msdf = (
+        field.reshape(shape) / lattice.spacing for field in (surface.hull_distance, surface.fields.msdf)
+    )
+    distance = hollows(hull, msdf, opacity, seen)
     if distance is None:
         return None
     carved = hollowed(surface, distance)
@@ -79,7 +81,7 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
         cleaned = clean(np.where(cleaned > 0, justified, proposed))
     radiance = fitted_radiance(after, fit).radiance()[0]
     msdf = without_specks(msdf_from_template(cleaned, after.mesh, lattice), after.mesh, lattice, min_area)
-    seen = Seen.on(lattice, after.mesh, radiance, surface.seen.light)
+    seen = Seen.on(lattice, after.mesh, radiance, surface.sight.light)
     return replace(carved.with_fields(msdf=msdf.numpy()), seen=seen)
 
 
@@ -98,7 +100,7 @@ def opacity_and_visibility(
         (N, N, N) opacities of a cell's length in [0, 1], z by y by x, and (N, N, N) whether a vertex is seen.
     """
     lattice = surface.lattice
-    near = np.flatnonzero(surface.hull < 2 * lattice.spacing)
+    near = np.flatnonzero(surface.hull_distance < 2 * lattice.spacing)
     points = mi.Transform4f(to_world) @ mi.Point3f(lattice.points(mi.Float).numpy()[:, near])
     opacity, seen = np.zeros(lattice.vertex_count, np.float32), np.ones(lattice.vertex_count, bool)
     opacity[near] = volume.opacity_at(points, lattice.spacing).numpy()

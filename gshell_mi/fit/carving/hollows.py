@@ -74,7 +74,9 @@ def hollowed(surface: Surface, distance: np.ndarray) -> Surface:
         distance: signed distances to the hollows, in cells, positive inside.
     """
     deep = surface.lattice.spacing * distance.ravel()
-    sdf, hull = (np.maximum(field, deep).astype(np.float32) for field in (surface.fields.sdf, surface.hull))
+    sdf, hull = (
+        np.maximum(field, deep).astype(np.float32) for field in (surface.fields.sdf, surface.hull_distance)
+    )
     return replace(surface.with_fields(sdf=sdf), hull=hull)
 
 

@@ -57,7 +57,7 @@ def hollowed_vessels(fit: Fit, surface: Surface) -> Surface | None:
     carved, lattice = vessel.template, surface.lattice
     front, _ = fitted_radiance(carved, fit).radiance()
     msdf = msdf_from_template(carved.logits, carved.mesh, lattice)
-    seen = Seen.on(lattice, carved.mesh, front, surface.seen.light)
+    seen = Seen.on(lattice, carved.mesh, front, surface.sight.light)
     return replace(vessel.surface.with_fields(msdf=msdf.numpy()), seen=seen)
 
 
@@ -103,7 +103,7 @@ class _Trials:
         self.fit, self.surface, self.template = fit, surface, template
         self.lattice, self._closed = surface.lattice, fit.judge.shown(template.closed)
         points = mi.Transform4f(fit.scene.subject.to_world) @ self.lattice.points(mi.Float)
-        self._inside = surface.hull < 0
+        self._inside = surface.hull_distance < 0
         self._points = points.numpy().T[self._inside]
 
     def best(self) -> _Vessel | None:

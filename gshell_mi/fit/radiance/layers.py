@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -22,13 +22,10 @@ def interpolated(
     active: bool | mi.Bool = True,
 ) -> _Value:
     """Values of a ``kind``, interleaved in ``values``, of three vertices, by barycentric weights."""
-    return sum(
-        (
-            weight * dr.gather(kind, values, vertex, active)
-            for vertex, weight in zip(vertices, weights, strict=True)
-        ),
-        kind(0),
-    )
+    mean: Any = 0
+    for vertex, weight in zip(vertices, weights, strict=True):
+        mean += weight * dr.gather(kind, values, vertex, active)
+    return mean
 
 
 @dataclass

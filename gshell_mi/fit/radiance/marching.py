@@ -214,4 +214,4 @@ def depth_along(bricks: Bricks, packets: mi.Float, rays: Rays) -> mi.Float:
 
 def _distance_to_brick(lookup: Lookup, position: mi.Point3f, active: mi.Bool) -> mi.Int32:
     place = dr.clip(mi.Point3i((position + 1) * (0.5 * mi.Float(lookup.side))), 0, lookup.side - 1)
-    return -lookup.voxel(*place, active)
+    return -lookup.voxel(place.x, place.y, place.z, active)

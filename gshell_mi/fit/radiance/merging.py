@@ -93,7 +93,7 @@ def merged(fit: Fit, surface: Surface, other: Surface) -> Merged:
     else:
         start = (other.fields, fields) if from_other else (fields, other.fields)
         mixed = _with_places(*start, places.share(taken != from_other))
-        found = _with_colors(fit, mixed, surface.seen.light)
+        found = _with_colors(fit, mixed, surface.sight.light)
         shown = fit.judge.shown(subject.surface_of(mixed).to_numpy()[:2])
     whole = fit.judge.compare(now.whole, shown.whole)
     kept = found if whole.accepted[0] else None
@@ -172,5 +172,5 @@ def _as_fine(mesh: Mesh, length: float) -> Mesh:
         edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
         if np.median(np.linalg.norm(edges, axis=-1)) <= 1.5 * length:
             break
-        vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)[:2]
     return vertices, faces

@@ -115,7 +115,7 @@ class RadianceVolume:
             self.level = 0
             near = hull < self._reach
             m = self._sides[0] // BRICK
-            bricks = near.reshape(m, BRICK, m, BRICK, m, BRICK).any(axis=(1, 3, 5))
+            bricks = np.any(near.reshape(m, BRICK, m, BRICK, m, BRICK), axis=(1, 3, 5))
             self._begin(Bricks.where(bricks))
 
     def arrays(self) -> dict[str, np.ndarray]:

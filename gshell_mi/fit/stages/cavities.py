@@ -80,14 +80,14 @@ def volume_inside(
     # From vertices to the centres of voxels.
     step = (lattice.stride - 1) / sides[0]
     hull = ndimage.affine_transform(
-        surface.hull.reshape((lattice.stride,) * 3),
+        surface.hull_distance.reshape((lattice.stride,) * 3),
         step * np.eye(3),
         0.5 * step,
         (sides[0],) * 3,
         order=1,
         mode="nearest",
     )
-    _, vertices, faces = closed_template(subject, surface.hull, lattice)
+    _, vertices, faces = closed_template(subject, surface.hull_distance, lattice)
     return RadianceVolume(
         hull,
         subject.to_world,

@@ -182,7 +182,7 @@ def start_material(
         return GivenMaterial(lattice.vertex_count, **given)
     if "vertex_color" in surface.model:
         return _resampled_material(surface, lattice)
-    radiance, known = surface.seen.radiance, surface.seen.known
+    radiance, known = surface.sight.radiance, surface.sight.known
     seen_on = lattice_of(lattice.grid, len(known))
     if seen_on != lattice:
         points = lattice.points(mi.Float)
@@ -191,7 +191,7 @@ def start_material(
         total = Interpolation(mi.Float(radiance.astype(np.float32).ravel()), seen_on)(points).numpy()
         known = share > _KNOWN
         radiance = total.reshape(-1, 3) / np.maximum(share, _KNOWN)[:, None]
-    seen = radiance / surface.seen.light
+    seen = radiance / surface.sight.light
     if config.model.even_start and not config.light_is_given and known.any():
         seen = np.broadcast_to(np.median(seen[known], axis=0), seen.shape)
     reflectance = np.where(known[:, None], seen, TYPICAL_REFLECTANCE)
@@ -222,7 +222,7 @@ def start_light(scene: FitScene, surface: Surface, config: FitConfig) -> Environ
         return None
     height = config.model.light_height
     light = EnvironmentLight.from_emitter(scene.light, height) or EnvironmentLight.uniform(
-        height, float(surface.seen.light)
+        height, float(surface.sight.light)
     )
     if "log_radiance" in surface.model:
         light.log_radiance = mi.TensorXf(surface.model["log_radiance"])

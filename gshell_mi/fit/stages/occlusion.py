@@ -63,7 +63,7 @@ class Occlusion:
             return surface
         ignored = [np.zeros(alpha.shape, bool) for alpha in fit.alphas]
         cell = fit.lattices.early.spacing * fit.scene.subject.length_scale
-        facts: dict[str, list[float]] = {"gain": [], "noise": []}
+        facts: dict[str, list[float | None]] = {"gain": [], "noise": []}
         with steps.task():
             before, *larger = _meshes(fit, ignored, [0, *disbelieved])
             shown = fit.judge.shown(before)

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...fields import LatticeFields
+from ...lattice import Lattice
 from ...template.msdf import clean_opacity
 from ...template.revoxelise import revoxelise
 from ...template.thin_sheets import Cut, collapsed_sheets
@@ -46,7 +47,7 @@ class Revoxelise:
 def best_moved(fit: Fit, surface: Surface, steps: Steps) -> tuple[Surface, str]:
     """The surface where its template has been moved to, and the stage that has; see ``Revoxelise``."""
     template = template_of(fit.scene.subject, surface)
-    radiance = template.mesh.interpolate(mi.Float(surface.seen.radiance.ravel()), 3).numpy().T
+    radiance = template.mesh.interpolate(mi.Float(surface.sight.radiance.ravel()), 3).numpy().T
     still = Moved("start", template.start, radiance)
     found, taken = _taken(fit, template, (*surface.moved, still), surface, steps)
     return without_unseen_parts(fit, replace(found, hull=None, moved=())), taken
@@ -104,6 +105,7 @@ def _revoxelised(
 ) -> tuple[Surface, str, bool] | None:
     """As of ``_made``, with one cut; None if it comes out torn."""
     lattice = surface.lattice
+    assert isinstance(lattice, Lattice), "blocks come with the joint stage"
     made = revoxelise(
         fit.scene.subject,
         lattice,
@@ -120,7 +122,7 @@ def _revoxelised(
         return None
     fields = made.fields
     closed = LatticeFields.closed(fields["sdf"], lattice.grid)
-    seen = Seen(fields["radiance"], fields["known"], surface.seen.light)
+    seen = Seen(fields["radiance"], fields["known"], surface.sight.light)
     return Surface(replace(closed, msdf=fields["msdf"]), seen=seen), candidate.stage, made.has_loops
 
 

@@ -60,8 +60,8 @@ class Texture:
             fine["vertex_roughness"],
             fine["vertex_metallic"],
         )
-        turns = fit.views.turns if fitted.light else None
-        lights = [] if turns is None else [fitted.light.turned(turn) for turn in turns]
+        light, turns = fitted.light, fit.views.turns
+        lights = [] if turns is None or light is None else [light.turned(turn) for turn in turns]
         work = BackProjection(
             start,
             other_objects(fit.scene, fitted.light),

@@ -39,7 +39,7 @@ class Volume:
         volume = self._volume(fit, fit.mesh(surface), steps.kept)
         steps.run(volume, self.config.iterations, volume.optimizers, volume.arrays)
         with steps.task("depth", len(fit.views)) as advance:
-            other = volume_surface(volume, fit.scene, fit.masks, lattice, surface.seen.light, advance)
+            other = volume_surface(volume, fit.scene, fit.masks, lattice, surface.sight.light, advance)
         if other is None:
             return surface
         with steps.task("verdict"):
