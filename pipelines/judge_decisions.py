@@ -30,13 +30,13 @@ from fit_study.command import add_scene_arguments  # noqa: E402
 from fit_study.settings import parsed_settings  # noqa: E402
 from silent_steps import Silent  # noqa: E402
 
+from gshell_mi.calibration.corrections import Corrections  # noqa: E402
 from gshell_mi.doctor import ensure_variant  # noqa: E402
 from gshell_mi.evaluation.mesh_scores import mesh_scores  # noqa: E402
 from gshell_mi.fit import FitConfig  # noqa: E402
 from gshell_mi.fit import stage as fit_stage  # noqa: E402
 from gshell_mi.fit.judge import Judge, Verdict, places_of  # noqa: E402
 from gshell_mi.fit.pipeline import pipeline  # noqa: E402
-from gshell_mi.fit.poses.corrections import Corrections  # noqa: E402
 from gshell_mi.fit.stage import Fit  # noqa: E402
 from gshell_mi.fit.surface import Surface  # noqa: E402
 from gshell_mi.fit.template import template_of  # noqa: E402

@@ -181,8 +181,8 @@ def _spoil(scene: Path) -> None:
     """Hides half of a view from its mask, and turns the cameras, so that stages find something."""
     import mitsuba as mi
 
+    from gshell_mi.calibration.corrections import Corrections
     from gshell_mi.export.stock_scene import write_scene
-    from gshell_mi.fit.poses.corrections import Corrections
     from gshell_mi.scene import load_fit_scene
 
     loaded = load_fit_scene(scene)

@@ -70,11 +70,26 @@ LIBRARY = {
             "json_files",
         ],
     ),
-    "fit": ("Fit", "From scenes to surfaces, materials and light.", ["fit"]),
+    "fit": ("Fit", "From scenes to surfaces, materials and light.", ["fit", "bounds", "preview"]),
+    "radiance": (
+        "Radiance and cameras",
+        "What images say of a surface before it has a material, and of where they were taken.",
+        ["radiance", "calibration"],
+    ),
     "losses": (
         "Losses, material, light",
         "What a fit minimises, and what it changes beside the surface.",
-        ["losses", "means", "material", "light", "extras", "schedules", "outliers", "tempered_adam"],
+        [
+            "losses",
+            "means",
+            "material",
+            "light",
+            "extras",
+            "schedules",
+            "outliers",
+            "tempered_adam",
+            "optimizer_arrays",
+        ],
     ),
     "evaluation": ("Evaluation", "How good a result is.", ["evaluation", "compare"]),
     "export": (

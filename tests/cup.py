@@ -12,10 +12,10 @@ from gshell_mi.compat import mesh_scene
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit.config import FitConfig
 from gshell_mi.fit.judge import Judge
-from gshell_mi.fit.radiance.surface_radiance import RadianceConfig
 from gshell_mi.fit.stages.cavities import CavitiesConfig
 from gshell_mi.fit.surface import Seen, Surface
 from gshell_mi.pixels import PixelPool
+from gshell_mi.radiance.surface_radiance import RadianceConfig
 from gshell_mi.targets import Target
 from gshell_mi.views import PinholeViews
 

@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from .bookkeeping.observer import Observer, Preview
+from ..preview import Preview
+from .bookkeeping.observer import Observer
 from .config import FitConfig
 
 if TYPE_CHECKING:

@@ -23,13 +23,13 @@ from ..scene_inputs import scene_inputs
 from .bookkeeping.checkpoint import Checkpoint
 from .bookkeeping.fingerprint import check_fingerprint, fingerprint
 from .bookkeeping.observer import Observer
+from .cameras.held_out import held_out_views
 from .config import EFFORTS, Effort, FitConfig, default_output
 from .fitted import Fitted
 from .joint.depth import check_depth
 from .lattices import Lattices
 from .memory import MemoryEstimate
 from .pipeline import pipeline
-from .poses.held_out import held_out_views
 from .runner import Runner, checkpoint_path
 from .scene_checks import check_given, check_names
 from .stage import Fit

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from .bounds import Between, check_bounds, leaves
+from ..bounds import Between, check_bounds, leaves
+from ..radiance.surface_radiance import RadianceConfig
+from .cameras.laying import CamerasConfig
 from .joint.config import LossConfig, ModelConfig, RenderConfig
-from .poses.laying import CamerasConfig
-from .radiance.config import VolumeConfig
-from .radiance.surface_radiance import RadianceConfig
 from .stages.cavities import CavitiesConfig
 from .stages.exposures import GainsConfig
 from .stages.hull import HullConfig
@@ -21,6 +20,7 @@ from .stages.openings import OpeningsConfig
 from .stages.refinement import FoldsConfig, RefinementConfig
 from .stages.smoothing import SmoothingConfig
 from .stages.texture import TextureConfig
+from .stages.volume import VolumeConfig
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.stats import false_discovery_control, norm
 
 from ..pixels import PixelPool, PixelSample
+from ..radiance.contrast import Contrast
+from ..radiance.lanes import chosen_lanes, joined_lanes
+from ..radiance.shown import JUDGING, Mesh, Met, Part, Shown
 from ..targets import Target
 from ..views import PinholeViews
-from .radiance.contrast import Contrast
-from .radiance.lanes import chosen_lanes, joined_lanes
-from .radiance.shown import JUDGING, Mesh, Met, Part, Shown
 
 #: Pixels this near to a mask's outline do not judge: where a surface ends to a cell is found later.
 _OUTLINE = 3

@@ -16,8 +16,9 @@ import numpy as np
 from ..errors import UserError
 from ..files import replacing
 from ..interrupt import Interrupt
+from ..optimizer_arrays import optimizer_arrays, restore_optimizer
 from ..progress import Progress
-from .bookkeeping.checkpoint import DONE, Checkpoint, optimizer_arrays, restore_optimizer
+from .bookkeeping.checkpoint import DONE, Checkpoint
 from .bookkeeping.observer import Observer
 from .stage import Fit, Stage, Work
 from .surface import Surface

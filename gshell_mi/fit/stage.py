@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from ..calibration.corrections import Corrections
 from ..fields.mask_distances import MaskDistances
 from ..light import turns_with_camera
 from ..packed_pixels import unpacked
 from ..pixels import PixelPool
+from ..preview import Preview
 from ..scene import FitScene
 from ..views import PinholeViews
-from .bookkeeping.observer import Preview
 from .judge import Judge
 from .lattices import Lattices
-from .poses.corrections import Corrections
 from .surface import Surface
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.joint.config import RenderConfig
 from gshell_mi.fit.memory import MemoryEstimate
-from gshell_mi.fit.radiance.config import VolumeConfig
+from gshell_mi.fit.stages.volume import VolumeConfig
 
 SIZES = np.full((48, 2), 256)
 

@@ -7,7 +7,7 @@ import pytest
 
 from gshell_mi import CubeLattice, FlexiCubesLattice, TetLattice, UserError, extract
 from gshell_mi.extras import network
-from gshell_mi.fit.bookkeeping.checkpoint import optimizer_arrays, restore_optimizer
+from gshell_mi.optimizer_arrays import optimizer_arrays, restore_optimizer
 from gshell_mi.parametrisation import StepRules, make_parametrisation
 from gshell_mi.parametrisation.parametrisation import touched
 from gshell_mi.topology import topology

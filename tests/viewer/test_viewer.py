@@ -13,7 +13,7 @@ from fitted import open_sphere
 
 from gshell_mi import UserError
 from gshell_mi.fit.__main__ import main
-from gshell_mi.fit.bookkeeping.observer import Preview
+from gshell_mi.preview import Preview
 from gshell_mi.scene import load_fit_scene
 from gshell_mi.viewer import Viewer
 from gshell_mi.viewer.parts import mesh_parts, template_part

@@ -3,30 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
+from ...preview import Preview
 from ...scene import FitScene
-
-
-@dataclass(frozen=True)
-class Preview:
-    """What a fit has found until now.
-
-    Attributes:
-        vertices: (V, 3) world positions.
-        faces: (F, 3) of the open mesh.
-        colors: (V, 3) linear Rec.709: radiance of the front before the joint stage, base colour in it.
-        template_vertices, template_faces: the watertight template.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    colors: np.ndarray
-    template_vertices: np.ndarray
-    template_faces: np.ndarray
 
 
 class Observer(Protocol):

@@ -9,12 +9,12 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
+from ...radiance.volume import RadianceVolume
 from ...template.msdf import CERTAIN, clean_opacity, msdf_from_template, without_specks
 from ...topology import topology
 from ...triangles import positive_part
-from ..radiance.acceptance import close_rejected
-from ..radiance.on_template import fitted_radiance
-from ..radiance.volume import RadianceVolume
+from ..acceptance import close_rejected
+from ..radiance_on_template import fitted_radiance
 from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import Template, lattice_index, template_of

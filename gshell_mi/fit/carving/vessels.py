@@ -19,10 +19,10 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from ...radiance.shown import Shown
 from ...template.msdf import CERTAIN, msdf_from_template
 from ...topology import equal_patches
-from ..radiance.on_template import fitted_radiance
-from ..radiance.shown import Shown
+from ..radiance_on_template import fitted_radiance
 from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import Template, template_of

@@ -20,9 +20,9 @@ from ...compat import write_mesh
 from ...images import decibels
 from ...material import principled
 from ...pixels import COVERED
+from ...preview import Preview
 from ...targets import Target, mean_radiance
 from ...views import PinholeViews
-from ..bookkeeping.observer import Preview
 
 #: Samples per pixel of a render. Their noise averages out over the pixels, views and rounds of a vertex.
 _SPP = 8

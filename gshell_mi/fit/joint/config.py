@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+from ...bounds import Between
 from ...memory import LONGEST_PATH
-from ..bounds import Between
 
 
 @dataclass(frozen=True)

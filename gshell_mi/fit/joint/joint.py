@@ -19,12 +19,12 @@ from ...material import GivenMaterial, MaterialField, principled
 from ...means import mean
 from ...outliers import finite
 from ...parametrisation import StepRules, make_parametrisation, parametrisation_named
+from ...preview import Preview
 from ...scene import FitScene
 from ...schedules import decay_at
 from ...tempered_adam import TemperedAdam
 from ...template.msdf import without_specks
 from ...timing import phase
-from ..bookkeeping.observer import Preview
 from .regularisers import Regularisers, StepView
 
 if TYPE_CHECKING:

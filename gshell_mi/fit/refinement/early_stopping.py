@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..bookkeeping.observer import Preview
+from ...preview import Preview
 from ..stage import Work
 
 

@@ -21,12 +21,12 @@ from ...fields.smoothing import MeshDiffusion
 from ...images import decibels
 from ...means import mean
 from ...outliers import trusted
+from ...preview import Preview
+from ...radiance.layers import Layer
+from ...radiance.surface_radiance import SurfaceRadiance
 from ...schedules import falling
 from ...template.outlines import Outlines
 from ...triangles import face_areas
-from ..bookkeeping.observer import Preview
-from ..radiance.layers import Layer
-from ..radiance.surface_radiance import SurfaceRadiance
 
 if TYPE_CHECKING:
     from ..stages.refinement import RefinementConfig

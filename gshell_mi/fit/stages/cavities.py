@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from ...radiance.config import TrainingConfig
+from ...radiance.volume import RadianceVolume, sides_of_levels
 from ..carving.carving import carve
 from ..carving.vessels import hollowed_vessels
-from ..radiance.config import TrainingConfig
-from ..radiance.volume import RadianceVolume, sides_of_levels
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface

@@ -11,9 +11,9 @@ from typing import Annotated
 
 import numpy as np
 
-from ..bounds import Between
-from ..exposures.gains import find_gains
-from ..exposures.observations import observe
+from ...bounds import Between
+from ...calibration.observations import observe
+from ..cameras.gains import find_gains
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import mitsuba as mi
 import numpy as np
 
+from ...bounds import Between
 from ...errors import UserError
 from ...fields import LatticeFields
 from ...fields.interpolation import Interpolation
@@ -18,7 +19,6 @@ from ...fields.thin_parts import thickened, thin_part_refinement
 from ...fields.visual_hull import doubting_hulls
 from ...lattice import CubeLattice, Lattice
 from ...scene import FitScene
-from ..bounds import Between
 from ..lattices import Lattices
 from ..runner import Steps
 from ..stage import Fit

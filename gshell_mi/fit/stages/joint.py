@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import mitsuba as mi
 import numpy as np
 
+from ...bounds import Between
 from ...fields import LatticeFields
 from ...fields.interpolation import Interpolation
 from ...lattice import BlockLattice, Lattice, lattice_of, make_lattice
@@ -21,7 +22,6 @@ from ...light import EnvironmentLight
 from ...material import GivenMaterial, MaterialField, given_material
 from ...scene import FitScene
 from ...template.msdf_transfer import transfer_msdf
-from ..bounds import Between
 from ..joint.joint import JointStage
 from ..runner import Steps
 from ..sheets import with_open_sheets

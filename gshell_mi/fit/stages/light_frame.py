@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...calibration.observations import observe
+from ...calibration.regression import ColorModel
 from ...light import turns_with_camera
-from ..exposures.observations import observe
-from ..exposures.regression import ColorModel
 from ..judge import verdict_of
 from ..runner import Steps
 from ..stage import Fit

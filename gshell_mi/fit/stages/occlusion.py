@@ -15,13 +15,13 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...bounds import Between
 from ...compat import mesh_scene
 from ...fields.mask_distances import MaskDistances
 from ...packed_pixels import packed
+from ...radiance.shown import Mesh
 from ...topology import lobes
-from ..bounds import Between
 from ..judge import places_of
-from ..radiance.shown import Mesh
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface

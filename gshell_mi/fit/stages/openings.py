@@ -18,18 +18,18 @@ import numpy as np
 
 from ... import losses
 from ...activations import sigmoid, softplus
+from ...bounds import Between
 from ...images import decibels
 from ...means import mean
 from ...pixels import FAINT
+from ...preview import Preview
+from ...radiance.shown import Shown
+from ...radiance.surface_radiance import SurfaceRadiance
 from ...schedules import decay_at
 from ...template.msdf import clean_opacity, msdf_from_template
 from ...template.sides import THIN
-from ..bookkeeping.observer import Preview
-from ..bounds import Between
+from ..acceptance import close_rejected, close_shallow, open_rejected
 from ..judge import Judge
-from ..radiance.acceptance import close_rejected, close_shallow, open_rejected
-from ..radiance.shown import Shown
-from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Seen, Surface

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ...calibration.corrections import Corrections
 from ...views import PinholeViews
-from ..poses.corrections import Corrections
-from ..poses.laying import CamerasConfig, Laying
+from ..cameras.laying import CamerasConfig, Laying
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface

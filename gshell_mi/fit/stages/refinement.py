@@ -13,10 +13,10 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 
+from ...radiance.surface_radiance import SurfaceRadiance
 from ...template.outlines import Outlines
 from ...triangles import positive_part
-from ..radiance.on_template import radiance_on
-from ..radiance.surface_radiance import SurfaceRadiance
+from ..radiance_on_template import radiance_on
 from ..refinement.early_stopping import EarlyStopping
 from ..refinement.refinement import PhotometricRefinement
 from ..runner import Steps

@@ -16,16 +16,16 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...radiance.shown import Shown
+from ...radiance.surface_radiance import SurfaceRadiance
 from ...template.caps import Recesses, least_bent
 from ...template.moved_parts import with_moved_parts
 from ...template.msdf import clean_opacity, reopened, rewritten, rim_diffusion
 from ...template.sides import opposite_sides
 from ...topology import inner, lobes
 from ...triangles import positive_part
+from ..acceptance import close_rejected, islands, open_rejected, worst_of
 from ..judge import Judge, Verdict, places_of
-from ..radiance.acceptance import close_rejected, islands, open_rejected, worst_of
-from ..radiance.shown import Shown
-from ..radiance.surface_radiance import SurfaceRadiance
 from ..runner import Steps
 from ..sheets import SURE
 from ..stage import Fit

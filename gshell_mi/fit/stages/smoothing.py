@@ -7,10 +7,10 @@ from typing import Annotated
 
 import mitsuba as mi
 
+from ...bounds import Between
+from ...radiance.shown import Shown
 from ...template.denoise import denoised
 from ...template.msdf import without_specks
-from ..bounds import Between
-from ..radiance.shown import Shown
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface

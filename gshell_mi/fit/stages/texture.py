@@ -8,10 +8,10 @@ from typing import Annotated
 import mitsuba as mi
 import numpy as np
 
+from ...bounds import Between
 from ...material import attributes_of
 from ...subdivision import subdivided
 from ...triangles import unit, vertex_areas
-from ..bounds import Between
 from ..fitted import Fitted
 from ..joint.back_projection import BackProjection, FineMesh
 from ..joint.joint import other_objects

@@ -3,22 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
 
 import mitsuba as mi
 import numpy as np
 
+from ...bounds import Between
 from ...fields.visual_hull import visual_hull
-from ..radiance.config import VolumeConfig
-from ..radiance.merging import merged
-from ..radiance.volume import RadianceVolume, sides_of_levels
-from ..radiance.volume_surface import volume_surface
+from ...radiance.config import TrainingConfig
+from ...radiance.volume import RadianceVolume, sides_of_levels
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface
 from ..unseen import without_unseen_parts
+from ..volume.merging import merged
+from ..volume.volume_surface import volume_surface
 
 #: From coarse to fine: what all views can tell of first.
 _LEVELS = 3
+
+
+@dataclass(frozen=True)
+class VolumeConfig(TrainingConfig):
+    """Radiance volume: another start, for what no hull shows."""
+
+    iterations: int = 700
+    """Steps of the radiance volume; the joint stage starts from what of its surface explains unseen views
+    better. 0 leaves it out."""
+    side: Annotated[int, Between(4)] = 256
+    """Voxels per side of its last level, rounded up to whole bricks of the first."""
+    resolution: Annotated[int, Between(4)] = 128
+    """Cells per side of the lattice, at least, if the fit starts from it and --resolution does not say."""
+    detail_resolution: Annotated[int, Between(4)] = 128
+    """Cells per side, at least, that the detail stage ends on then, in blocks around the surface."""
 
 
 class Volume:

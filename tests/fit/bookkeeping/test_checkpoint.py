@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from gshell_mi import UserError
-from gshell_mi.fit.bookkeeping.checkpoint import FORMAT, Checkpoint, optimizer_arrays, restore_optimizer
+from gshell_mi.fit.bookkeeping.checkpoint import FORMAT, Checkpoint
+from gshell_mi.optimizer_arrays import optimizer_arrays, restore_optimizer
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ import trimesh
 
 from gshell_mi.fields.mask_distances import MaskDistances
 from gshell_mi.fit.judge import Judge
-from gshell_mi.fit.radiance.layers import Layer
-from gshell_mi.fit.radiance.surface_radiance import RadianceConfig, SurfaceRadiance
 from gshell_mi.fit.refinement.refinement import PhotometricRefinement, _barycentric
 from gshell_mi.fit.stages.refinement import RefinementConfig
 from gshell_mi.pixels import PixelPool
+from gshell_mi.radiance.layers import Layer
+from gshell_mi.radiance.surface_radiance import RadianceConfig, SurfaceRadiance
 from gshell_mi.targets import Target
 from gshell_mi.template.outlines import Outlines
 from gshell_mi.views import PinholeViews

@@ -10,13 +10,13 @@ from bowl import CLOSED, RADIUS, SHORT
 from scipy.spatial.transform import Rotation
 from silent_steps import Silent
 
+from gshell_mi.calibration.corrections import Corrections
 from gshell_mi.export.stock_scene import write_scene
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+from gshell_mi.fit.cameras.held_out import held_out_views
+from gshell_mi.fit.cameras.laying import Laying
 from gshell_mi.fit.judge import Verdict
-from gshell_mi.fit.poses.corrections import Corrections
-from gshell_mi.fit.poses.held_out import held_out_views
-from gshell_mi.fit.poses.laying import Laying
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.poses import Poses
 from gshell_mi.fit.surface import Surface

@@ -1,0 +1,1 @@
+"""Which corrections of cameras and exposures the images justify."""

@@ -1,1 +1,0 @@
-"""Cameras that are not quite where they are said to be, corrected by what the views agree on."""

@@ -1,0 +1,1 @@
+"""The second start of a surface: what a radiance volume shows and no hull does."""
