@@ -19,6 +19,7 @@ from .stages.poses import Poses
 from .stages.refinement import Refinement
 from .stages.revision import Revision
 from .stages.revoxelise import Revoxelise
+from .stages.rims import Rims
 from .stages.smoothing import Smoothing
 from .stages.texture import Texture
 from .stages.volume import Volume
@@ -72,6 +73,7 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
             *([Revision(config.openings)] if revises else []),  # what is open after all
             Joint("detail", config.detail, config.detail.iterations),  # the same on the last lattice
             *aligned,  # further, by what is better now
+            *([Rims(config.openings)] if revises else []),  # where openings end
         ]
     else:
         start.append(Joint("joint", config.joint, config.iterations, lattices.last))

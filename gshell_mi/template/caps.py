@@ -12,6 +12,7 @@ from scipy.sparse import diags, eye
 from scipy.sparse.linalg import spsolve
 
 from ..fields.smoothing import mesh_laplacian
+from ..topology import equal_patches
 from ..triangles import area_vectors, unit, vertex_areas
 from .sides import cast
 
@@ -40,6 +41,29 @@ def least_bent(vertices: np.ndarray, faces: np.ndarray, free: np.ndarray) -> np.
     return moved
 
 
+def facing_one_way(vertices: np.ndarray, faces: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """(V,) ids of the connected patches that places of a mesh fall into, if each shall face one way.
+
+    A recess goes in one way, and what is proposed may go around an edge. Both ways are those of the principal
+    axis of a place's normals.
+
+    Args:
+        vertices, faces: of the mesh.
+        place: (V,) which place a vertex is in, from 0; -1 if in none.
+    """
+    chosen = np.flatnonzero(place >= 0)
+    normals = np.zeros((len(vertices), 3))
+    np.add.at(normals, faces, area_vectors(vertices, faces)[:, None])
+    normals, owner = unit(normals)[chosen], place[chosen]
+    spread = np.zeros((int(place.max()) + 1, 3, 3))
+    weights = vertex_areas(vertices, faces)[chosen, None, None]
+    np.add.at(spread, owner, weights * normals[:, :, None] * normals[:, None])
+    axis = np.linalg.eigh(spread)[1][:, :, -1]
+    side = np.full(len(vertices), -1)
+    side[chosen] = 2 * owner + (np.einsum("ni,ni->n", normals, axis[owner]) > 0)
+    return equal_patches(side, faces)
+
+
 class Recesses:
     """Places of a mesh pushed in along their mean normals: flat floors, and walls twice as steep as a ball's.
 
@@ -48,9 +72,10 @@ class Recesses:
     Args:
         vertices, faces: of the mesh, oriented outwards.
         place: (V,) which of the places, at least one, a vertex is in, from 0; -1 if in none.
+        kept: thickness that a recess leaves, at least, if there is as much.
     """
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, place: np.ndarray):
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, place: np.ndarray, kept: float = 0):
         self.vertices, self.faces = np.asarray(vertices, np.float64), faces
         self.chosen = np.flatnonzero(place >= 0)
         self.place = place[self.chosen]
@@ -67,10 +92,11 @@ class Recesses:
         """(C,) depth of a ball's recess, as deep as it is wide from rim to middle."""
         self.width = np.zeros(count)
         np.maximum.at(self.width, self.place, self.ball)
-        self.room = self._half_way()
+        behind = self._behind()
+        self.room = np.minimum(behind / 2, np.maximum(behind - kept, 0))
 
-    def _half_way(self) -> np.ndarray:
-        """(C,) from each chosen vertex half of the way to what lies behind it."""
+    def _behind(self) -> np.ndarray:
+        """(C,) way from each chosen vertex to what lies behind it; 0 where nothing does."""
         # From beside the vertices: a ray through an edge of what is behind might meet neither of its faces.
         beside = np.zeros(len(self.vertices), int)
         beside[self.faces] = np.arange(len(self.faces))[:, None]
@@ -82,7 +108,7 @@ class Recesses:
         )
         # What is met first from inside is a back.
         within = np.einsum("ni,ni->n", area_vectors(self.vertices, self.faces)[face], self.inwards) > 0
-        return np.where(within & np.isfinite(distance), distance, 0) / 2
+        return np.where(within & np.isfinite(distance), distance, 0)
 
     def depths(self, least: float) -> list[float]:
         """From the least one on each twice as deep as the one before, as far as there is room."""

@@ -25,7 +25,7 @@ from .sides import normals_at_vertices, opposite_sides
 from .values_nearby import values_nearby
 
 #: The lattice holds what is this thick, in cells, whatever its direction ...
-_THICKNESS = 1.2
+HELD = 1.2
 
 #: ... and of a sheet, whose open side may be anywhere, there is no reason to be sparing ...
 _SLAB = 1.8
@@ -207,7 +207,7 @@ def thickened(
         thickness, opposite = opposite_sides(before, moved, faces, cell)
         other = np.isfinite(thickness) & solid[opposite]
         share = np.where(solid, np.where(other, 0.5, 0.0), np.where(other, 1.0, 0.5))
-        wanted = np.where(solid & other, _SOLID_THICKNESS, np.where(other, _SLAB, _THICKNESS))
+        wanted = np.where(solid & other, _SOLID_THICKNESS, np.where(other, _SLAB, HELD))
         growth = np.clip(wanted * cell - thickness, 0, None) * share
         growth = smooth(mi.Float(growth.astype(np.float32))).numpy()
         # Smoothing must not move the side that counts.

@@ -54,7 +54,7 @@ STAGES = _group(
     ("no-poses", "*poses*: cameras corrected", {"poses": "keep"}),
     (
         "no-revision",
-        "*revision*: openings judged again where the surface has moved",
+        "*revision*, and *rims*: openings judged again where the surface has moved",
         {"openings.revise": False},
     ),
     ("no-detail", "*detail*: a finer lattice", {"detail.iterations": 0}),

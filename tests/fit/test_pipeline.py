@@ -17,7 +17,7 @@ from gshell_mi.lattice import TetLattice
 
 VOLUME = ["volume", "fine_folds"]
 LAST = ["smoothing", "texture"]
-END = ["poses", "revision", "detail", "alignment", *LAST]
+END = ["poses", "revision", "detail", "alignment", "rims", *LAST]
 START = ["light", "openings", "exposures", "cavities", "refinement", "folds", "revoxelise"]
 KEPT = [stage for stage in START if stage != "exposures"]
 GEOMETRY = [stage for stage in KEPT if stage != "light"]
@@ -42,7 +42,7 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
         ({"light_frame": "world"}, ["occlusion", "hull", *START[1:], *VOLUME, "joint", *END]),
         ({"known_light": True}, ["occlusion", "hull", *START[1:], *VOLUME, "joint", *END]),
         ({"occlusion.most": 0.0}, ["hull", *START, *VOLUME, "joint", *END]),
-        ({"poses": "keep"}, ["occlusion", "hull", *START, *VOLUME, "joint", "revision", "detail", *LAST]),
+        ({"poses": "keep"}, ["occlusion", "hull", *START, *VOLUME, "joint", "revision", "detail", "rims", *LAST]),
         (
             {"openings.revise": False},
             [
@@ -70,6 +70,7 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
                 "revision",
                 "detail",
                 "alignment",
+                "rims",
                 "smoothing",
             ],
         ),

@@ -147,6 +147,7 @@ def test_log_has_a_line_per_step(whole):
     metrics = json.loads((whole / "metrics.json").read_text())
     if metrics["openings_changed"] or metrics["recessed_vertices"] or metrics["poses_kept"]:
         counts["detail"] = FitConfig().detail.iterations
+    counts["rims"] = 100  # there is an opening
     assert steps(whole) == [(stage, i) for stage, count in counts.items() for i in range(count)]
     losses = [json.loads(line)["image"] for line in (whole / "log.jsonl").read_text().splitlines()]
     assert np.mean(losses[90:100]) < 0.8 * np.mean(losses[:10]), "the openings stage learns"
@@ -241,7 +242,7 @@ def test_killed_and_resumed(bowl_scene, tmp_path):
 
     On one thread, as sums over several depend on their order, and fits diverge tenfold with every step.
     """
-    kills = {"openings": 30, "cavities": 5, "refinement": 3, "joint": 1, "revision": 40, "texture": 2}
+    kills = {"openings": 30, "cavities": 5, "refinement": 3, "joint": 1, "revision": 40, "rims": 40, "texture": 2}
     options = ("--texture.rounds", "1")
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     finish(start(bowl_scene, whole, *options, program=ONE_THREAD))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from cap import cap
 
-from gshell_mi.template.caps import Recesses, least_bent
+from gshell_mi.template.caps import Recesses, facing_one_way, least_bent
 
 RADIUS = 0.6
 
@@ -49,6 +49,25 @@ def test_a_recess_ends_half_way_to_what_is_behind_it(ball):
     moved = recesses.at(10.0)
     assert moved[place == 0, 2].min() == pytest.approx(0, abs=0.01)
     assert recesses.depths(0.3) == pytest.approx([0.3, 0.6, 1.2])
+
+
+def test_a_recess_leaves_some_thickness_where_there_is_as_much(ball):
+    """A disc that is thinner to its rim."""
+    flat = ball.vertices * [1, 1, 0.1]
+    place = np.where(ball.vertices[:, 2] > 0.05, 0, -1)
+    thickness = 2 * flat[place == 0, 2]
+    left = Recesses(flat, ball.faces, place, kept=0.12).at(10.0)[place == 0, 2] + thickness / 2
+    np.testing.assert_allclose(left, np.clip(0.12, thickness / 2, thickness), atol=0.01)
+
+
+def test_what_goes_around_an_edge_faces_two_ways(ball):
+    """The rim of a disc, and a cap beside it that faces one way only."""
+    flat, radius = ball.vertices * [1, 1, 0.1], np.hypot(*ball.vertices.T[:2])
+    place = np.where(radius > 0.8, 0, np.where(cap(ball, [0, 0, 1], 0.05), 1, -1))
+    patch = facing_one_way(flat, ball.faces, place)
+    sides = [np.unique(patch[(place == 0) & (sign * ball.vertices[:, 2] > 0.01)]) for sign in (-1, 1)]
+    assert len(sides[0]) == len(sides[1]) == 1 and sides[0] != sides[1]
+    assert len(np.unique(patch[place == 1])) == 1 and not np.isin(patch[place < 0], patch[place >= 0]).any()
 
 
 def test_only_thin_parts_have_another_side(ball):

@@ -37,7 +37,7 @@ from ..template import template_of
 
 #: Logits below which connected parts are proposed as openings, one after the other as long as some are
 #: rejected: where gloss has made nearly all transparent, an opening still is so the most.
-_LEVELS = 0.0, -0.75, -1.5, -2.25
+LEVELS = 0.0, -0.75, -1.5, -2.25
 
 #: Logit, at most, of what has been justified before.
 _OPEN = -1.0
@@ -170,7 +170,7 @@ def justified(
         (V,) logits, negative at openings.
     """
     levels = 0
-    for level in _LEVELS:
+    for level in LEVELS:
         # Openings of the levels before, and what is as transparent as this one.
         candidate = clean(np.minimum(logits, smoothed - level))
         if not ((candidate <= 0) & (logits > 0)).any():

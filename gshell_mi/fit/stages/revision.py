@@ -16,11 +16,13 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...radiance.shown import Shown
+from ...extraction.surface_mesh import SurfaceMesh
+from ...radiance.shown import Mesh, Shown
 from ...radiance.surface_radiance import SurfaceRadiance
-from ...template.caps import Recesses, least_bent
+from ...template.caps import Recesses, facing_one_way, least_bent
 from ...template.moved_parts import with_moved_parts
 from ...template.msdf import clean_opacity, reopened, rewritten, rim_diffusion
+from ...template.revoxelise import HELD
 from ...template.sides import opposite_sides
 from ...topology import inner, lobes
 from ...triangles import positive_part
@@ -30,7 +32,7 @@ from ..runner import Steps
 from ..sheets import SURE
 from ..stage import Fit
 from ..surface import Surface
-from .openings import OpacityTraining, OpeningsConfig, justified
+from .openings import LEVELS, OpacityTraining, OpeningsConfig, justified
 
 #: Standard errors by which an opening has to explain more than a cap: half of what it takes to open one. A
 #: false slit below the chair's rail has from -2.0 to 3.7, from fit to fit; true openings have 1.9 to 13.
@@ -47,27 +49,11 @@ class Revision:
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface with other openings, if there are any."""
-        lattice, fields, cell = surface.lattice, surface.fields, fit.cell(surface)
-        template = fit.scene.subject.surface_of(fields, template=True)
+        cell, (template, values) = fit.cell(surface), cut_template(fit, surface)
         vertices, faces, _ = template.to_numpy()
-        values = template.interpolate(mi.Float(fields.msdf)).numpy() / lattice.spacing
         now = fit.judge.shown(positive_part(vertices, faces, values))
-        appearance = SurfaceRadiance(
-            vertices,
-            faces,
-            fit.views,
-            fit.pixels,
-            fit.config.radiance,
-            seed=fit.config.seed,
-            mirrored=now.mirrored,
-        )
-        steps.run(
-            OpacityTraining(appearance, self.config),
-            self.config.iterations,
-            {"radiance": appearance.optimizer},
-        )
+        proposed = proposals(fit, now, (vertices, faces), self.config, steps)
         with steps.task("verdict"):
-            proposed = appearance.smoothed_logits()
             thickness, opposite = opposite_sides(vertices, vertices, faces, cell)
             thin = np.isfinite(thickness)
             smooth = least_bent(vertices, faces, (values <= 0) & ~thin)
@@ -79,6 +65,7 @@ class Revision:
             shown = fit.judge.shown((moved, faces), like=now)
             revised = _with_islands(fit.judge, shown, revised, proposed)
             revised, recessed = _opened(fit, shown, revised, proposed, cell)
+            recessed = _sunk(fit, fit.judge.shown((recessed, faces), like=now), revised, proposed, cell)
             deeper = (recessed != moved).any(axis=1)
             revised = clean_opacity(revised, moved, faces, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
@@ -86,13 +73,36 @@ class Revision:
         steps.fact("recessed_vertices", int((deeper & (revised > 0)).sum()))
         if not (changed | deeper).any():
             return surface
-        smooth = rim_diffusion(faces, len(vertices))
-        cut, near = reopened(lattice.spacing * values, revised <= 0, smooth, lattice.spacing)
-        msdf = rewritten(mi.Float(fields.msdf), cut, near, template, lattice).numpy()
-        surface = replace(surface.with_fields(msdf=msdf), settled=False)
+        surface = opened_at(surface, template, values, revised <= 0)
         elsewhere = (capped | deeper) & (revised > 0)
         moved = np.where(elsewhere[:, None], recessed, vertices)
         return surface if (moved == vertices).all() else _moved(fit, surface, vertices, moved, faces, revised)
+
+
+def cut_template(fit: Fit, surface: Surface) -> tuple[SurfaceMesh, np.ndarray]:
+    """A surface's template, and what cuts it: (V,) values, in cells, negative where it is open."""
+    template = fit.scene.subject.surface_of(surface.fields, template=True)
+    return template, template.interpolate(mi.Float(surface.fields.msdf)).numpy() / surface.lattice.spacing
+
+
+def proposals(fit: Fit, now: Shown, template: Mesh, config: OpeningsConfig, steps: Steps) -> np.ndarray:
+    """(V,) opacity logits of a closed template, of a radiance that mirrors what the surface ``now`` does."""
+    appearance = SurfaceRadiance(
+        *template, fit.views, fit.pixels, fit.config.radiance, seed=fit.config.seed, mirrored=now.mirrored
+    )
+    optimizers = {"radiance": appearance.optimizer}
+    steps.run(OpacityTraining(appearance, config), config.iterations, optimizers)
+    return appearance.smoothed_logits()
+
+
+def opened_at(surface: Surface, template: SurfaceMesh, values: np.ndarray, opened: np.ndarray) -> Surface:
+    """The surface with the openings, (V,) of its template's vertices, and smooth rims where they differ from
+    those of its ``values``, (V,) in cells."""
+    _, faces, _ = template.to_numpy()
+    lattice, smooth = surface.lattice, rim_diffusion(faces, len(values))
+    cut, near = reopened(lattice.spacing * values, opened, smooth, lattice.spacing)
+    msdf = rewritten(mi.Float(surface.fields.msdf), cut, near, template, lattice).numpy()
+    return replace(surface.with_fields(msdf=msdf), settled=False)
 
 
 def _moved(
@@ -194,7 +204,7 @@ def _opened(
     if not opened.any():
         return values, vertices
     place = places_of(opened, lobes(opened, faces))
-    recesses = Recesses(vertices, faces, place)
+    recesses = Recesses(vertices, faces, place, HELD * cell)
     closed = np.where(opened, -values, values)
     depth, least = _recessed(fit.judge, template, recesses, closed, values, place, cell)
     values = np.where(opened & ~(least > 0)[place], -values, values)
@@ -203,6 +213,57 @@ def _opened(
     together = fit.judge.shown((recesses.at(depth), faces), like=template).part(values)
     better = fit.judge.compare(now, together, place, template).gain > 0
     return np.where(opened & ~better[place], closed, values), recesses.at(np.where(better, depth, 0))
+
+
+def _sunk(fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray, cell: float) -> np.ndarray:
+    """(V, 3) vertices of the template, moved deeper where unseen views are explained better so.
+
+    Where a recess is filled, such as a fold or the gap between a hat's crown and its brim, the radiance fades
+    as it does at an opening; but what is seen through it is as wrong as before.
+
+    Args:
+        fit: the views.
+        template: closed.
+        values: (V,) negative at its openings.
+        proposed: (V,) opacity logits.
+        cell: side of a lattice cell, world units.
+    """
+    (vertices, faces), judge = template.mesh, fit.judge
+    for level in LEVELS:
+        logits = clean_opacity(
+            np.where(values > 0, proposed - level, values), vertices, faces, fit.config.topology.min_area
+        )
+        chosen = (logits <= 0) & (values > 0)
+        if not chosen.any():
+            continue
+        place = places_of(chosen, lobes(chosen, faces))
+        place = places_of(chosen, facing_one_way(vertices, faces, place))
+        recesses = Recesses(vertices, faces, place, HELD * cell)
+        depth = _best_depth(judge, template, recesses, values, place, cell)
+        if depth.any():
+            vertices = recesses.at(depth)
+            template = judge.shown((vertices, faces), like=template)
+    return vertices
+
+
+def _best_depth(
+    judge: Judge, template: Shown, recesses: Recesses, values: np.ndarray, place: np.ndarray, cell: float
+) -> np.ndarray:
+    """(P,) depth of the recess that explains unseen views best, 0 where none does surely better than nothing;
+    ``values`` (V,) are negative at openings."""
+    now, depths, verdicts = template.part(values), recesses.depths(cell), []
+    rises = np.full(int(place.max()) + 1, True)
+    best = np.zeros(len(rises))
+    for depth in depths:
+        shown = judge.shown((recesses.at(depth), template.mesh[1]), like=template)
+        verdicts.append(judge.compare(now, shown.part(values), place, template))
+        rises &= verdicts[-1].gain > best
+        if not rises.any():
+            break
+        best = np.maximum(best, verdicts[-1].gain)
+    tried = Verdict.together(verdicts)
+    gain = np.where(tried.accepted, tried.gain, 0).reshape(len(verdicts), -1)
+    return np.where(gain.max(axis=0) > 0, np.array(depths)[gain.argmax(axis=0)], 0)
 
 
 def _recessed(

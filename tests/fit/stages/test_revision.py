@@ -17,7 +17,7 @@ from gshell_mi.fields import sphere
 from gshell_mi.fit.judge import Judge
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.hull import Hull
-from gshell_mi.fit.stages.revision import Revision, _closed, _moved, _recessed
+from gshell_mi.fit.stages.revision import Revision, _closed, _moved, _recessed, _sunk
 from gshell_mi.fit.surface import Surface
 from gshell_mi.lattice import TetLattice
 from gshell_mi.template.caps import Recesses
@@ -171,6 +171,26 @@ def test_what_lies_half_way_is_a_recess_and_what_lies_behind_is_seen_through_an_
         assert recesses.at(depth)[lid, 1].min() == pytest.approx(floor, abs=0.15) and least[0] < 0
     else:
         assert least[0] > 0
+
+
+def test_what_is_filled_sinks_where_something_is_proposed():
+    """The lid of a block that is a cup in truth, its floor in the middle, and a side of it that is right."""
+    views, _, targets = capture(cup(0.0, WALL))
+    judge = Judge(views, targets, Judge.halves(len(views)), batch=16384)
+    config = SimpleNamespace(topology=SimpleNamespace(min_area=0.001))
+    side = 0.06
+    vertices, faces = trimesh.remesh.subdivide_to_size(solid_block().vertices, solid_block().faces, side)
+    lid = (vertices[:, 1] > HALF - 1e-6) & (np.abs(vertices[:, [0, 2]]) < HALF - WALL).all(axis=1)
+    wall = (vertices[:, 0] > HALF - 1e-6) & (np.abs(vertices[:, 1:]) < HALF - WALL).all(axis=1)
+    template, closed = judge.shown((vertices, faces)), np.ones(len(vertices))
+    fit = SimpleNamespace(judge=judge, config=config)
+    moved = _sunk(fit, template, closed, np.where(lid | wall, -1.0, 1.0), side)
+    assert moved[lid, 1].min() == pytest.approx(0, abs=0.15)
+    np.testing.assert_array_equal(moved[~lid], vertices[~lid])
+    np.testing.assert_array_equal(_sunk(fit, template, closed, closed, side), vertices)
+    # What has opened stays as it is.
+    opened = np.where(lid, -1.0, 1.0)
+    np.testing.assert_array_equal(_sunk(fit, template, opened, opened, side), vertices)
 
 
 @pytest.mark.parametrize("recess", [False, True])

@@ -1,0 +1,68 @@
+"""Rims: openings grow to where the finished surface ends.
+
+What an opening grows by is no discrete change: its rim moves, and no loop comes or goes. But steps of an
+optimiser move it by a cell or so, and pieces of the lid that was in a mouth are larger. On the surface that
+the last steps leave, the same radiance with opacity and the same judge see where such pieces explain less
+than what is behind them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...template.msdf import clean_opacity
+from ...topology import lobes, mesh_edges, spread
+from ...triangles import positive_part
+from ..acceptance import close_rejected
+from ..judge import places_of
+from ..runner import Steps
+from ..stage import Fit
+from ..surface import Surface
+from .openings import OpeningsConfig, justified
+from .revision import cut_template, opened_at, proposals
+
+
+class Rims:
+    """Lets the openings that there are grow, where unseen views are explained better so."""
+
+    name = "rims"
+
+    def __init__(self, config: OpeningsConfig):
+        self.config = config
+
+    def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
+        """The surface with wider openings."""
+        template, values = cut_template(fit, surface)
+        vertices, faces, _ = template.to_numpy()
+        given = values <= 0
+        if not given.any() or given.all():
+            return surface
+        now = fit.judge.shown(positive_part(vertices, faces, values))
+        proposed = proposals(fit, now, (vertices, faces), self.config, steps)
+        with steps.task("verdict"):
+            closed = fit.judge.shown((vertices, faces), like=now)
+            edges, before = mesh_edges(faces)[0], closed.part(values)
+
+            def clean(logits: np.ndarray) -> np.ndarray:
+                both = np.where(given, values, logits)
+                cleaned = clean_opacity(both, vertices, faces, fit.config.topology.min_area)
+                return np.where(given, values, cleaned)
+
+            def judged(candidate: np.ndarray) -> np.ndarray:
+                growth = grown(candidate <= 0, given, faces, edges)
+                logits = np.where(growth | given, candidate, np.abs(candidate))
+                return close_rejected(logits, closed, fit.judge, before, given)
+
+            grows = justified(proposed, np.where(given, values, np.abs(proposed)), clean, judged) <= 0
+        steps.fact("rims_moved", bool((grows & ~given).any()))
+        return opened_at(surface, template, values, grows) if (grows & ~given).any() else surface
+
+
+def grown(opened: np.ndarray, given: np.ndarray, faces: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """(V,) which of the ``opened`` (V,) vertices are in patches beside the ``given`` (V,) ones."""
+    new = opened & ~given
+    if not new.any():
+        return new
+    place = places_of(new, lobes(new, faces))
+    beside = np.bincount(place[new], spread(given, edges)[new]) > 0
+    return new & beside[place]
