@@ -42,7 +42,10 @@ def names(subject: mi.Shape, settings: dict) -> list[str]:
         ({"light_frame": "world"}, ["occlusion", "hull", *START[1:], *VOLUME, "joint", *END]),
         ({"known_light": True}, ["occlusion", "hull", *START[1:], *VOLUME, "joint", *END]),
         ({"occlusion.most": 0.0}, ["hull", *START, *VOLUME, "joint", *END]),
-        ({"poses": "keep"}, ["occlusion", "hull", *START, *VOLUME, "joint", "revision", "detail", "rims", *LAST]),
+        (
+            {"poses": "keep"},
+            ["occlusion", "hull", *START, *VOLUME, "joint", "revision", "detail", "rims", *LAST],
+        ),
         (
             {"openings.revise": False},
             [

@@ -242,7 +242,15 @@ def test_killed_and_resumed(bowl_scene, tmp_path):
 
     On one thread, as sums over several depend on their order, and fits diverge tenfold with every step.
     """
-    kills = {"openings": 30, "cavities": 5, "refinement": 3, "joint": 1, "revision": 40, "rims": 40, "texture": 2}
+    kills = {
+        "openings": 30,
+        "cavities": 5,
+        "refinement": 3,
+        "joint": 1,
+        "revision": 40,
+        "rims": 40,
+        "texture": 2,
+    }
     options = ("--texture.rounds", "1")
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     finish(start(bowl_scene, whole, *options, program=ONE_THREAD))
