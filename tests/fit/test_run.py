@@ -145,7 +145,8 @@ def test_log_has_a_line_per_step(whole):
     assert 1 <= rounds <= 1 + FitConfig().openings.rounds
     # The lattice is the joint stage's: there is more to do only where something has changed since.
     metrics = json.loads((whole / "metrics.json").read_text())
-    if metrics["openings_changed"] or metrics["recessed_vertices"] or metrics["poses_kept"]:
+    changes = "openings_changed", "recessed_vertices", "dents_filled", "poses_kept"
+    if any(metrics[change] for change in changes):
         counts["detail"] = FitConfig().detail.iterations
     counts["rims"] = 100  # there is an opening
     assert steps(whole) == [(stage, i) for stage, count in counts.items() for i in range(count)]

@@ -27,6 +27,7 @@ from ...template.sides import opposite_sides
 from ...topology import inner, lobes
 from ...triangles import positive_part
 from ..acceptance import close_rejected, islands, open_rejected, worst_of
+from ..carving.dents import without_dents
 from ..judge import Judge, Verdict, places_of
 from ..runner import Steps
 from ..sheets import SURE
@@ -71,12 +72,18 @@ class Revision:
         changed = (revised <= 0) != (values <= 0)
         steps.fact("openings_changed", bool(changed.any()))
         steps.fact("recessed_vertices", int((deeper & (revised > 0)).sum()))
-        if not (changed | deeper).any():
-            return surface
-        surface = opened_at(surface, template, values, revised <= 0)
         elsewhere = (capped | deeper) & (revised > 0)
-        moved = np.where(elsewhere[:, None], recessed, vertices)
-        return surface if (moved == vertices).all() else _moved(fit, surface, vertices, moved, faces, revised)
+        if changed.any():
+            surface = opened_at(surface, template, values, revised <= 0)
+        if elsewhere.any():
+            moved = np.where(elsewhere[:, None], recessed, vertices)
+            surface = replace(_moved(fit, surface, vertices, moved, faces, revised), settled=False)
+        with steps.task("dents"):
+            filled, dents = without_dents(fit, surface)
+        if dents is not None:
+            steps.fact("dents_verdict", dents.facts())
+        steps.fact("dents_filled", filled is not surface)
+        return surface if filled is surface else replace(filled, settled=False)
 
 
 def cut_template(fit: Fit, surface: Surface) -> tuple[SurfaceMesh, np.ndarray]:
