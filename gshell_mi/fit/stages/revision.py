@@ -4,7 +4,8 @@ They are first sought on a hull, before anything is known of exposures, cameras 
 that is wrong, what is seen through a true opening is explained no better than by its cap, and a false one
 may be right behind the surface. So the same radiance with opacity, and the same judge, are asked once more.
 An opening that explains unseen views no better than a cap does closes; what is proposed and explains them
-better opens, or becomes a recess if that explains them as well; what nobody tells of stays as it is.
+better opens, or becomes a recess if that explains them as well; what nobody tells of stays as it is. Other
+recesses, and dents that are none, are judged in the same way.
 """
 
 from __future__ import annotations
