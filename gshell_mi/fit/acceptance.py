@@ -13,6 +13,10 @@ from ..template.caps import Recesses
 from ..topology import equal_patches, lobes, mesh_components, mesh_edges, patch_sizes, spread
 from .judge import Judge, places_of
 
+#: Logits below which connected parts are proposed as openings, one after the other as long as some are
+#: rejected: where gloss has made nearly all transparent, an opening still is so the most.
+LEVELS = 0.0, -0.75, -1.5, -2.25
+
 #: Rounds in which openings are closed; in the last one all that are rejected.
 _CLOSINGS = 7
 

@@ -28,16 +28,12 @@ from ...radiance.surface_radiance import SurfaceRadiance
 from ...schedules import decay_at
 from ...template.msdf import clean_opacity, msdf_from_template
 from ...template.sides import THIN
-from ..acceptance import close_rejected, close_shallow, open_rejected
+from ..acceptance import LEVELS, close_rejected, close_shallow, open_rejected
 from ..judge import Judge
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import template_of
-
-#: Logits below which connected parts are proposed as openings, one after the other as long as some are
-#: rejected: where gloss has made nearly all transparent, an opening still is so the most.
-LEVELS = 0.0, -0.75, -1.5, -2.25
 
 #: Logit, at most, of what has been justified before.
 _OPEN = -1.0

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from ...extraction.surface_mesh import SurfaceMesh
 from ...radiance.shown import Mesh, Shown
 from ...radiance.surface_radiance import SurfaceRadiance
-from ...template.caps import Recesses, facing_one_way, least_bent
+from ...template.caps import Recesses, least_bent
 from ...template.moved_parts import with_moved_parts
 from ...template.msdf import clean_opacity, reopened, rewritten, rim_diffusion
 from ...template.revoxelise import HELD
@@ -29,12 +29,13 @@ from ...topology import inner, lobes
 from ...triangles import positive_part
 from ..acceptance import close_rejected, islands, open_rejected, worst_of
 from ..carving.dents import without_dents
-from ..judge import Judge, Verdict, places_of
+from ..carving.recesses import recess_depths, sunk
+from ..judge import Judge, places_of
 from ..runner import Steps
 from ..sheets import SURE
 from ..stage import Fit
 from ..surface import Surface
-from .openings import LEVELS, OpacityTraining, OpeningsConfig, justified
+from .openings import OpacityTraining, OpeningsConfig, justified
 
 #: Standard errors by which an opening has to explain more than a cap: half of what it takes to open one. A
 #: false slit below the chair's rail has from -2.0 to 3.7, from fit to fit; true openings have 1.9 to 13.
@@ -67,7 +68,7 @@ class Revision:
             shown = fit.judge.shown((moved, faces), like=now)
             revised = _with_islands(fit.judge, shown, revised, proposed)
             revised, recessed = _opened(fit, shown, revised, proposed, cell)
-            recessed = _sunk(fit, fit.judge.shown((recessed, faces), like=now), revised, proposed, cell)
+            recessed = sunk(fit, fit.judge.shown((recessed, faces), like=now), revised, proposed, cell)
             deeper = (recessed != moved).any(axis=1)
             revised = clean_opacity(revised, moved, faces, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
@@ -214,98 +215,10 @@ def _opened(
     place = places_of(opened, lobes(opened, faces))
     recesses = Recesses(vertices, faces, place, HELD * cell)
     closed = np.where(opened, -values, values)
-    depth, least = _recessed(fit.judge, template, recesses, closed, values, place, cell)
+    depth, least = recess_depths(fit.judge, template, recesses, closed, values, place, cell)
     values = np.where(opened & ~(least > 0)[place], -values, values)
     depth[least > 0] = 0
     # Each was judged beside others that may have come out otherwise.
     together = fit.judge.shown((recesses.at(depth), faces), like=template).part(values)
     better = fit.judge.compare(now, together, place, template).gain > 0
     return np.where(opened & ~better[place], closed, values), recesses.at(np.where(better, depth, 0))
-
-
-def _sunk(fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray, cell: float) -> np.ndarray:
-    """(V, 3) vertices of the template, moved deeper where unseen views are explained better so.
-
-    Where a recess is filled, such as a fold or the gap between a hat's crown and its brim, the radiance fades
-    as it does at an opening; but what is seen through it is as wrong as before.
-
-    Args:
-        fit: the views.
-        template: closed.
-        values: (V,) negative at its openings.
-        proposed: (V,) opacity logits.
-        cell: side of a lattice cell, world units.
-    """
-    (vertices, faces), judge = template.mesh, fit.judge
-    for level in LEVELS:
-        logits = clean_opacity(
-            np.where(values > 0, proposed - level, values), vertices, faces, fit.config.topology.min_area
-        )
-        chosen = (logits <= 0) & (values > 0)
-        if not chosen.any():
-            continue
-        place = places_of(chosen, lobes(chosen, faces))
-        place = places_of(chosen, facing_one_way(vertices, faces, place))
-        recesses = Recesses(vertices, faces, place, HELD * cell)
-        depth = _best_depth(judge, template, recesses, values, place, cell)
-        if depth.any():
-            vertices = recesses.at(depth)
-            template = judge.shown((vertices, faces), like=template)
-    return vertices
-
-
-def _best_depth(
-    judge: Judge, template: Shown, recesses: Recesses, values: np.ndarray, place: np.ndarray, cell: float
-) -> np.ndarray:
-    """(P,) depth of the recess that explains unseen views best, 0 where none does surely better than nothing;
-    ``values`` (V,) are negative at openings."""
-    now, depths, verdicts = template.part(values), recesses.depths(cell), []
-    rises = np.full(int(place.max()) + 1, True)
-    best = np.zeros(len(rises))
-    for depth in depths:
-        shown = judge.shown((recesses.at(depth), template.mesh[1]), like=template)
-        verdicts.append(judge.compare(now, shown.part(values), place, template))
-        rises &= verdicts[-1].gain > best
-        if not rises.any():
-            break
-        best = np.maximum(best, verdicts[-1].gain)
-    tried = Verdict.together(verdicts)
-    gain = np.where(tried.accepted, tried.gain, 0).reshape(len(verdicts), -1)
-    return np.where(gain.max(axis=0) > 0, np.array(depths)[gain.argmax(axis=0)], 0)
-
-
-def _recessed(
-    judge: Judge,
-    template: Shown,
-    recesses: Recesses,
-    closed: np.ndarray,
-    opened: np.ndarray,
-    place: np.ndarray,
-    cell: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Recesses at the places of new openings: what lies behind a surface need not be nothing.
-
-    Where the surface fills a recess, whatever lies deeper explains more than it does, and a hole is deep.
-
-    Args:
-        judge: of the fit.
-        template: closed.
-        recesses: of it.
-        closed, opened: (V,) values, negative at openings, without and with the new ones.
-        place: (V,) of the new openings, P places, -1 elsewhere.
-        cell: side of a lattice cell, world units.
-
-    Returns:
-        (P,) depth of the recess that explains unseen views best, 0 where none does surely better than the
-        surface; (P,) by how much at least an opening explains them better than a recess does.
-    """
-    now, holes = template.part(closed), template.part(opened)
-    depths, verdicts, openings = recesses.depths(cell), [], []
-    for depth in depths:
-        recess = judge.shown((recesses.at(depth), template.mesh[1]), like=template).part(closed)
-        verdicts.append(judge.compare(now, recess, place, template))
-        openings.append(judge.compare(recess, holes, place, template).gain)
-    tried = Verdict.together(verdicts)
-    gain = np.where(tried.accepted, tried.gain, 0).reshape(len(depths), -1)
-    best = gain.argmax(axis=0)
-    return np.where(gain.max(axis=0) > 0, np.array(depths)[best], 0), np.min(openings, axis=0)

@@ -14,35 +14,13 @@ from silent_steps import Silent
 
 from gshell_mi.extraction import extract
 from gshell_mi.fields import sphere
+from gshell_mi.fit.carving.recesses import recess_depths, sunk
 from gshell_mi.fit.judge import Judge
-from gshell_mi.fit.stage import Fit
-from gshell_mi.fit.stages.hull import Hull
-from gshell_mi.fit.stages.revision import Revision, _closed, _moved, _recessed, _sunk
+from gshell_mi.fit.stages.revision import Revision, _closed, _moved
 from gshell_mi.fit.surface import Surface
 from gshell_mi.lattice import TetLattice
 from gshell_mi.template.caps import Recesses
 from gshell_mi.topology import inner, topology
-
-#: Fewer steps and pixels, as so small images need.
-SMALL = {
-    "openings.iterations": 100,
-    "radiance.batch": 16384,
-    "radiance.smoothing": 8.0,
-    "openings.mask": 0.01,
-    "openings.binary": 0.015,
-    "openings.closing": 0.003,
-}
-
-
-@pytest.fixture(scope="module")
-def fit(exact):
-    return Fit(exact.scene, exact.config.changed(SMALL), exact.lattices)
-
-
-@pytest.fixture(scope="module")
-def hull(fit):
-    """The bowl with a lid."""
-    return Hull(fit.config.hull).run(fit, None, Silent())
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +142,7 @@ def test_what_lies_half_way_is_a_recess_and_what_lies_behind_is_seen_through_an_
     lid = (vertices[:, 1] > HALF - 1e-6) & (np.abs(vertices[:, [0, 2]]) < HALF - wall).all(axis=1)
     place, closed = np.where(lid, 0, -1), np.ones(len(vertices))
     recesses = Recesses(vertices, faces, place)
-    depth, least = _recessed(
+    depth, least = recess_depths(
         judge, judge.shown((vertices, faces)), recesses, closed, np.where(lid, -1, closed), place, side
     )
     if floor == 0:
@@ -184,13 +162,13 @@ def test_what_is_filled_sinks_where_something_is_proposed():
     wall = (vertices[:, 0] > HALF - 1e-6) & (np.abs(vertices[:, 1:]) < HALF - WALL).all(axis=1)
     template, closed = judge.shown((vertices, faces)), np.ones(len(vertices))
     fit = SimpleNamespace(judge=judge, config=config)
-    moved = _sunk(fit, template, closed, np.where(lid | wall, -1.0, 1.0), side)
+    moved = sunk(fit, template, closed, np.where(lid | wall, -1.0, 1.0), side)
     assert moved[lid, 1].min() == pytest.approx(0, abs=0.15)
     np.testing.assert_array_equal(moved[~lid], vertices[~lid])
-    np.testing.assert_array_equal(_sunk(fit, template, closed, closed, side), vertices)
+    np.testing.assert_array_equal(sunk(fit, template, closed, closed, side), vertices)
     # What has opened stays as it is.
     opened = np.where(lid, -1.0, 1.0)
-    np.testing.assert_array_equal(_sunk(fit, template, opened, opened, side), vertices)
+    np.testing.assert_array_equal(sunk(fit, template, opened, opened, side), vertices)
 
 
 @pytest.mark.parametrize("recess", [False, True])

@@ -6,32 +6,9 @@ import pytest
 from cap import cap
 from silent_steps import Silent
 
-from gshell_mi.fit.stage import Fit
-from gshell_mi.fit.stages.hull import Hull
 from gshell_mi.fit.stages.revision import Revision
 from gshell_mi.fit.stages.rims import Rims, grown
 from gshell_mi.topology import mesh_edges, topology
-
-#: Fewer steps and pixels, as so small images need.
-SMALL = {
-    "openings.iterations": 100,
-    "radiance.batch": 16384,
-    "radiance.smoothing": 8.0,
-    "openings.mask": 0.01,
-    "openings.binary": 0.015,
-    "openings.closing": 0.003,
-}
-
-
-@pytest.fixture(scope="module")
-def fit(exact):
-    return Fit(exact.scene, exact.config.changed(SMALL), exact.lattices)
-
-
-@pytest.fixture(scope="module")
-def hull(fit):
-    """The bowl with a lid."""
-    return Hull(fit.config.hull).run(fit, None, Silent())
 
 
 def counted(fit, surface):
