@@ -17,7 +17,7 @@ import tyro
 
 from .doctor import ensure_variant
 from .errors import UserError
-from .interrupt import Interrupt
+from .interrupt import Interrupt, forget_interrupt
 from .kernel_cache import kernel_cache_problem
 from .streams import with_streams
 
@@ -79,6 +79,7 @@ def run_command(
                     raise
             else:
                 return 0
+        forget_interrupt()
         print(interrupted(parsed), file=sys.stderr)
         return 130
 

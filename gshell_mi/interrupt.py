@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import threading
 from collections.abc import Iterator
@@ -67,6 +68,15 @@ def interrupts_held_back() -> Iterator[None]:
         signal.signal(signal.SIGINT, previous)
     if came and callable(previous):
         previous(*came[0])
+
+
+def forget_interrupt() -> None:
+    """Lets the process end with its own exit code after a Ctrl-C that was handled.
+
+    Where C++ was running Python code then, as Mitsuba does while a variant loads, CPython keeps in mind that
+    nobody has handled it there, and dies of the signal at its end. It forgets when it runs other code so.
+    """
+    ctypes.pythonapi.PyRun_SimpleString(b"pass")
 
 
 def check_interrupt() -> None:

@@ -133,6 +133,32 @@ def test_it_works_from_the_first_second_on(bowl_scene, tmp_path, loading, share)
     assert "Traceback" not in told and "Interrupted" in told
 
 
+INTERRUPTED_IN_CODE_THAT_C_RUNS = """
+import ctypes, sys
+from dataclasses import dataclass
+from gshell_mi.command_line import run_command
+
+@dataclass
+class Arguments:
+    number: int = 0
+
+def work(given):
+    run = ctypes.pythonapi.PyRun_String
+    run.restype, run.argtypes = ctypes.py_object, [ctypes.c_char_p, ctypes.c_int, *[ctypes.py_object] * 2]
+    run(b"raise KeyboardInterrupt", 257, {}, {})  # 257: statements
+
+sys.exit(run_command("fit", "Interrupted.", Arguments, work, []))
+"""
+
+
+def test_the_exit_code_is_ours_where_c_was_running_python(tmp_path):
+    (tmp_path / "interrupted.py").write_text(INTERRUPTED_IN_CODE_THAT_C_RUNS)
+    found = run(
+        "interrupted", stderr=subprocess.PIPE, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(Path.cwd())}
+    )
+    assert (found.returncode, found.stderr) == (130, "Interrupted.\n")
+
+
 INTERRUPT_WHEN_DRJIT_LOADS = """
 import os, signal, sys
 
