@@ -67,7 +67,7 @@ def close_rejected(
         place = places_of(kept, lobes(kept, faces))
         after = template.part(np.where(kept | given, -np.abs(logits), np.abs(logits)))
         verdict = replace(judge.compare(before, after, place), rejected=closed)
-        grows = np.bincount(place[kept], beside[kept]) > 0
+        grows = parts_with(beside, place)
         worst = ~(verdict.accepted | grows & np.isfinite(verdict.noise) & (verdict.gain > 0))
         # The worst first; all where none is worse but some are not surely better, and in the last round.
         if closing:
@@ -90,6 +90,16 @@ def close_rejected(
         if not kept.any():
             break
     return np.where(opened & ~kept, -logits, logits)
+
+
+def parts_with(chosen: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """(P,) which places, of (V,) vertices, -1 where in none, have a chosen (V,) one.
+
+    >>> parts_with(np.array([True, False, True]), np.array([-1, 0, 1])).tolist()
+    [False, True]
+    """
+    told = place >= 0
+    return np.bincount(place[told], chosen[told]) > 0
 
 
 def worst_of(loss: np.ndarray) -> np.ndarray:

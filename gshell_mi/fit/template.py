@@ -101,3 +101,12 @@ def lattice_index(points: np.ndarray, to_world: mi.ScalarTransform4f, side: int)
     """
     local = mi.Transform4f(to_world).inverse() @ mi.Point3f(np.ascontiguousarray(points.T, np.float32))
     return ((local + 1) * (0.5 * side)).numpy()[::-1]
+
+
+def at_nearest(values: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """(V,) what an array of a lattice's vertices, (n, n, n), has at those nearest to (3, V) indices.
+
+    >>> at_nearest(np.arange(8).reshape(2, 2, 2), np.array([[0.4, 5.0], [0.6, 1.0], [0.0, -3.0]])).tolist()
+    [2, 6]
+    """
+    return values[tuple(np.clip(np.rint(index).astype(int), 0, len(values) - 1))]

@@ -17,7 +17,7 @@ from ..acceptance import close_rejected
 from ..radiance_on_template import fitted_radiance
 from ..stage import Fit
 from ..surface import Seen, Surface
-from ..template import Template, lattice_index, template_of
+from ..template import Template, at_nearest, lattice_index, template_of
 from .hollows import hollowed, hollows
 
 #: Space is empty below this opacity of a cell.
@@ -122,8 +122,8 @@ def _in_empty_space(
 
 def _kept(fit: Fit, before: Template, after: Template, label: np.ndarray) -> np.ndarray:
     """(count,) which hollows explain unseen views better, by the rays that enter them."""
-    index = np.rint(lattice_index(before.vertices, fit.scene.subject.to_world, len(label) - 1)).astype(int)
-    place = label[tuple(np.clip(index, 0, len(label) - 1))] - 1
+    index = lattice_index(before.vertices, fit.scene.subject.to_world, len(label) - 1)
+    place = at_nearest(label, index) - 1
     return fit.judge.compare(
         fit.judge.shown(before.surface).whole,
         fit.judge.shown(after.surface).whole,

@@ -15,7 +15,7 @@ from ..judge import Verdict, places_of
 from ..sheets import SURE
 from ..stage import Fit
 from ..surface import Surface
-from ..template import lattice_index
+from ..template import at_nearest, lattice_index
 
 #: Radii of balls that do not fit into a dent, in cells: craters in a gilded hat are 6 to 12 cells wide.
 _RADII = 8.0, 4.0
@@ -44,28 +44,26 @@ def without_dents(fit: Fit, surface: Surface) -> tuple[Surface, Verdict | None]:
     lattice, verdicts = whole.lattice, []
     if lattice.vertex_count != lattice.stride**3:
         return surface, None
-    filled = whole
+    filled, shown = whole, None
     for radius in _RADII:
         distance = filled.fields.sdf.reshape((lattice.stride,) * 3) / lattice.spacing
         label = dents(distance, radius)
         if not label.any():
             continue
-        before, after = fit.mesh(filled), fit.mesh(_without(filled, label > 0))
+        after = fit.mesh(_without(filled, label > 0))
         index = lattice_index(after[0], fit.scene.subject.to_world, lattice.stride - 1)
         # Vertices beside a dent belong to it, if they are where nothing was.
-        near = ndimage.maximum_filter(label, 3)[
-            tuple(np.clip(np.rint(index).astype(int), 0, lattice.stride - 1))
-        ]
+        near = at_nearest(ndimage.maximum_filter(label, 3), index)
         moved = (near > 0) & (ndimage.map_coordinates(distance, index, order=1) > _MOVED)
         if not moved.any():
             continue
-        shown = fit.judge.shown(before)
+        shown = shown or fit.judge.shown(fit.mesh(filled))
         other = fit.judge.shown(after, like=shown)
         verdict = fit.judge.compare(shown.whole, other.whole, places_of(moved, near), other)
         verdicts.append(verdict)
         better = np.unique(near[moved])[verdict.accepted]
         if len(better):
-            filled = _without(filled, np.isin(label, better))
+            filled, shown = _without(filled, np.isin(label, better)), None
     said = Verdict.together(verdicts) if verdicts else None
     if filled is whole:
         return surface, said

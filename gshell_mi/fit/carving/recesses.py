@@ -64,6 +64,12 @@ def _best_depth(
         if not rises.any():
             break
         best = np.maximum(best, verdicts[-1].gain)
+    return _best(depths, verdicts)
+
+
+def _best(depths: list[float], verdicts: list[Verdict]) -> np.ndarray:
+    """(P,) which of the depths gains most at each place, of those accepted; 0 where none is. The verdicts are
+    on the first ones, for all places each."""
     tried = Verdict.together(verdicts)
     gain = np.where(tried.accepted, tried.gain, 0).reshape(len(verdicts), -1)
     return np.where(gain.max(axis=0) > 0, np.array(depths)[gain.argmax(axis=0)], 0)
@@ -100,7 +106,4 @@ def recess_depths(
         recess = judge.shown((recesses.at(depth), template.mesh[1]), like=template).part(closed)
         verdicts.append(judge.compare(now, recess, place, template))
         openings.append(judge.compare(recess, holes, place, template).gain)
-    tried = Verdict.together(verdicts)
-    gain = np.where(tried.accepted, tried.gain, 0).reshape(len(depths), -1)
-    best = gain.argmax(axis=0)
-    return np.where(gain.max(axis=0) > 0, np.array(depths)[best], 0), np.min(openings, axis=0)
+    return _best(depths, verdicts), np.min(openings, axis=0)

@@ -23,7 +23,7 @@ from ...images import decibels
 from ...means import mean
 from ...pixels import FAINT
 from ...preview import Preview
-from ...radiance.shown import Shown
+from ...radiance.shown import Mesh, Shown
 from ...radiance.surface_radiance import SurfaceRadiance
 from ...schedules import decay_at
 from ...template.msdf import clean_opacity, msdf_from_template
@@ -179,6 +179,33 @@ def justified(
             break
     # Those of one level have not been judged beside those of the next ones, through which they may be seen.
     return clean(judged(logits)) if levels > 1 else logits
+
+
+def further_openings(
+    template: Mesh,
+    values: np.ndarray,
+    proposed: np.ndarray,
+    min_area: float,
+    judged: Callable[[np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """``justified``, beside openings that stay as they are.
+
+    Args:
+        template: closed.
+        values: (V,) negative where it is open.
+        proposed: (V,) opacity logits.
+        min_area: of new openings, and of new islands, as of ``clean_opacity``.
+        judged: as of ``justified``.
+
+    Returns:
+        (V,) values, negative at all openings.
+    """
+    given = values <= 0
+
+    def clean(logits: np.ndarray) -> np.ndarray:
+        return np.where(given, values, clean_opacity(np.where(given, values, logits), *template, min_area))
+
+    return justified(proposed, np.where(given, values, np.abs(proposed)), clean, judged)
 
 
 def find_openings(

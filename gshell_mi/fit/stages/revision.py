@@ -35,7 +35,7 @@ from ..runner import Steps
 from ..sheets import SURE
 from ..stage import Fit
 from ..surface import Surface
-from .openings import OpacityTraining, OpeningsConfig, justified
+from .openings import OpacityTraining, OpeningsConfig, further_openings
 
 #: Standard errors by which an opening has to explain more than a cap: half of what it takes to open one. A
 #: false slit below the chair's rail has from -2.0 to 3.7, from fit to fit; true openings have 1.9 to 13.
@@ -67,8 +67,8 @@ class Revision:
             moved = np.where(capped[:, None], smooth, vertices)
             shown = fit.judge.shown((moved, faces), like=now)
             revised = _with_islands(fit.judge, shown, revised, proposed)
-            revised, recessed = _opened(fit, shown, revised, proposed, cell)
-            recessed = sunk(fit, fit.judge.shown((recessed, faces), like=now), revised, proposed, cell)
+            revised, shown = _opened(fit, shown, revised, proposed, cell)
+            recessed = sunk(fit, shown, revised, proposed, cell)
             deeper = (recessed != moved).any(axis=1)
             revised = clean_opacity(revised, moved, faces, fit.config.topology.min_area)
         changed = (revised <= 0) != (values <= 0)
@@ -181,7 +181,7 @@ def _with_islands(judge: Judge, template: Shown, values: np.ndarray, proposed: n
 
 def _opened(
     fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray, cell: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, Shown]:
     """Opens, or moves deeper, what explains unseen views better so.
 
     Args:
@@ -192,26 +192,20 @@ def _opened(
         cell: side of a lattice cell, world units.
 
     Returns:
-        (V,) values, negative also at new openings; (V, 3) vertices of the template, those of recesses moved.
+        (V,) values, negative also at new openings; the template, where recesses have come.
     """
     vertices, faces = template.mesh
     given, now = values <= 0, template.part(values)
-
-    def clean(logits: np.ndarray) -> np.ndarray:
-        both = np.where(given, values, logits)
-        cleaned = clean_opacity(both, vertices, faces, fit.config.topology.min_area)
-        return np.where(given, values, cleaned)
-
-    start, standing = np.where(given, values, np.abs(proposed)), islands(~given, faces)[0]
+    standing = islands(~given, faces)[0]
 
     def judged(candidate: np.ndarray) -> np.ndarray:
         kept = close_rejected(candidate, template, fit.judge, now, given)
         return open_rejected(kept, template, fit.judge, standing)
 
-    values = justified(proposed, start, clean, judged)
+    values = further_openings(template.mesh, values, proposed, fit.config.topology.min_area, judged)
     opened = (values <= 0) & ~given
     if not opened.any():
-        return values, vertices
+        return values, template
     place = places_of(opened, lobes(opened, faces))
     recesses = Recesses(vertices, faces, place, HELD * cell)
     closed = np.where(opened, -values, values)
@@ -221,4 +215,5 @@ def _opened(
     # Each was judged beside others that may have come out otherwise.
     together = fit.judge.shown((recesses.at(depth), faces), like=template).part(values)
     better = fit.judge.compare(now, together, place, template).gain > 0
-    return np.where(opened & ~better[place], closed, values), recesses.at(np.where(better, depth, 0))
+    recessed = recesses.at(np.where(better, depth, 0)), faces
+    return np.where(opened & ~better[place], closed, values), fit.judge.shown(recessed, like=template)

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...template.msdf import clean_opacity
 from ...topology import lobes, mesh_edges, spread
 from ...triangles import positive_part
-from ..acceptance import close_rejected
+from ..acceptance import close_rejected, parts_with
 from ..judge import places_of
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface
-from .openings import OpeningsConfig, justified
+from .openings import OpeningsConfig, further_openings
 from .revision import cut_template, opened_at, proposals
 
 
@@ -41,28 +40,24 @@ class Rims:
         proposed = proposals(fit, now, (vertices, faces), self.config, steps)
         with steps.task("verdict"):
             closed = fit.judge.shown((vertices, faces), like=now)
-            edges, before = mesh_edges(faces)[0], closed.part(values)
-
-            def clean(logits: np.ndarray) -> np.ndarray:
-                both = np.where(given, values, logits)
-                cleaned = clean_opacity(both, vertices, faces, fit.config.topology.min_area)
-                return np.where(given, values, cleaned)
+            before = closed.part(values)
 
             def judged(candidate: np.ndarray) -> np.ndarray:
-                growth = grown(candidate <= 0, given, faces, edges)
+                growth = grown(candidate <= 0, given, faces)
                 logits = np.where(growth | given, candidate, np.abs(candidate))
                 return close_rejected(logits, closed, fit.judge, before, given)
 
-            grows = justified(proposed, np.where(given, values, np.abs(proposed)), clean, judged) <= 0
-        steps.fact("rims_moved", bool((grows & ~given).any()))
-        return opened_at(surface, template, values, grows) if (grows & ~given).any() else surface
+            min_area = fit.config.topology.min_area
+            opened = further_openings(closed.mesh, values, proposed, min_area, judged) <= 0
+        moved = bool((opened & ~given).any())
+        steps.fact("rims_moved", moved)
+        return opened_at(surface, template, values, opened) if moved else surface
 
 
-def grown(opened: np.ndarray, given: np.ndarray, faces: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """(V,) which of the ``opened`` (V,) vertices are in patches beside the ``given`` (V,) ones."""
+def grown(opened: np.ndarray, given: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V,) which of the ``opened`` (V,) vertices are in parts beside the ``given`` (V,) ones."""
     new = opened & ~given
     if not new.any():
         return new
     place = places_of(new, lobes(new, faces))
-    beside = np.bincount(place[new], spread(given, edges)[new]) > 0
-    return new & beside[place]
+    return new & parts_with(spread(given, mesh_edges(faces)[0]), place)[place]

@@ -20,7 +20,7 @@ from ...template.msdf_transfer import transfer_msdf
 from ..judge import Verdict
 from ..stage import Fit
 from ..surface import Seen, Surface
-from ..template import closed_template, lattice_index
+from ..template import at_nearest, closed_template, lattice_index
 from .volume_surface import without_floaters
 
 #: Cells by which a place has to be inside of one surface and outside of the other: what is less deep, the
@@ -127,8 +127,7 @@ class _Places:
 
     def at(self, index: np.ndarray) -> np.ndarray:
         """(V,) places that points, at (3, V) indices, are beside; what is beside none is one more."""
-        nearest = tuple(np.clip(np.rint(index).astype(int), 0, len(self.owner) - 1))
-        return np.where(self.away[nearest] <= _BESIDE, self.owner[nearest], self.count)
+        return at_nearest(np.where(self.away <= _BESIDE, self.owner, self.count), index)
 
     def share(self, chosen: np.ndarray) -> np.ndarray:
         """(N^3,) 1 beside the (P,) chosen places, P not 0, and falling to 0 over as many cells again."""
