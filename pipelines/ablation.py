@@ -6,7 +6,7 @@ A row fits every scene with the settings of the first row but for those of one s
 if ``--rows`` names such. Fits run one after another; a fit whose scores exist under the same settings is not
 made again, and one that was interrupted goes on, so stop and start the command as you like. The mesh is
 scored against the scene's ``truth.ply``, and renderings from the sensors of its ``test.xml``, which no fit
-sees, against those of its ``reference.xml``.
+sees, against those of its ``reference.xml``. Of the fit with all stages, the surface is scored after each.
 After code has changed, start with an empty ``--output``.
 """
 
@@ -22,7 +22,7 @@ sys.path[:0] = [str(REPOSITORY / "pipelines"), str(REPOSITORY)]
 from fit_study.ablation_rows import ROWS, STAGES  # noqa: E402
 from fit_study.command import add_common_arguments, run_study  # noqa: E402
 from fit_study.settings import as_flags, non_default  # noqa: E402
-from fit_study.tables import LEGEND, table  # noqa: E402
+from fit_study.tables import LEGEND, stages_table, table  # noqa: E402
 from fit_study.trials import Trial, load_outcome  # noqa: E402
 
 from gshell_mi.fit import FitConfig  # noqa: E402
@@ -63,6 +63,8 @@ def page(scenes: list[Path], base: FitConfig, output: Path, options: str) -> str
         ]
         if any(outcome for *_, outcome in rows):
             text += f"## {scene.stem}\n\n{table(rows, 'what is left out')}\n"
+        if rows[0][-1] and (stages := stages_table(rows[0][-1])):
+            text += f"After each stage of the fit with all of them, in its order:\n\n{stages}\n"
     return text.rstrip() + "\n"
 
 

@@ -101,6 +101,9 @@ def fit_of(subject: mi.Shape, shape: trimesh.Trimesh, config: FitConfig = CONFIG
         config=config,
         training=training,
         judge=judges[0],
+        outline_judge=Judge(
+            views, targets, Judge.halves(len(views)), batch=config.radiance.batch, off_outline=0
+        ),
         validation_judge=judges[1],
         cell=lambda surface: surface.lattice.spacing * subject.length_scale,
         mesh=lambda surface: subject.surface_of(surface.fields).to_numpy()[:2],

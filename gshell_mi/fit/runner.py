@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from .bookkeeping.checkpoint import DONE, Checkpoint
 from .bookkeeping.observer import Observer
 from .stage import Fit, Stage, Work
 from .surface import Surface
+from .template import preview_of
 
 #: Between two checkpoints at least this many times what writing one takes.
 _CHECKPOINT_PAUSE = 10
@@ -86,6 +88,8 @@ class Runner:
                 surface = stage.run(seen, surface, Steps(self, stage.name, surface)).after(surface)
                 checkpoint.stage, checkpoint.iteration, checkpoint.arrays = following, 0, surface.to_arrays()
                 self.save()
+                if self.observer:
+                    self.observer.stage_done(stage.name, partial(preview_of, seen, surface))
                 # Sizes that this stage needed are not those of the next.
                 dr.flush_malloc_cache()
         return surface

@@ -83,13 +83,19 @@ class Fit:
         return self._judge(Judge.halves(len(self.views)))
 
     @cached_property
+    def outline_judge(self) -> Judge:
+        """Decides on changes of the surface that the joint stage leaves. It ends where masks do, to a pixel,
+        so pixels beside outlines count: without them, leaf and lace lost a strip of a cell along all rims."""
+        return self._judge(Judge.halves(len(self.views)), off_outline=0)
+
+    @cached_property
     def validation_judge(self) -> Judge:
         """Tells what the other views say of what was fitted to ``training``."""
         return self._judge([self._validation])
 
-    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]]) -> Judge:
-        config = self.config
-        return Judge(self.views, self.scene.targets, splits, batch=config.radiance.batch, seed=config.seed)
+    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]], **options: int) -> Judge:
+        batch, seed = self.config.radiance.batch, self.config.seed
+        return Judge(self.views, self.scene.targets, splits, batch=batch, seed=seed, **options)
 
     @property
     def _validation(self) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +114,7 @@ class Fit:
         Args:
             surface: that tells; of a fit as it was given.
         """
-        for pool in ("masks", "pixels", "training", "judge", "validation_judge"):
+        for pool in ("masks", "pixels", "training", "judge", "outline_judge", "validation_judge"):
             self.__dict__.pop(pool, None)
         targets, sensors = self.scene.targets, self.scene.sensors
         if surface.gains is not None:

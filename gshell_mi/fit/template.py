@@ -12,9 +12,14 @@ from ..extraction.surface_mesh import SurfaceMesh
 from ..fields import LatticeFields
 from ..fields.thin_parts import back_on_solid
 from ..lattice import BlockLattice, Lattice
+from ..preview import Preview
 from ..template.msdf import CERTAIN
 from ..triangles import positive_part
+from .stage import Fit
 from .surface import Surface
+
+#: Linear grey of a surface whose colours are not asked for.
+_GREY = 0.5
 
 #: A template takes its opacity from another one that is at most this many cells away.
 _REACH = 1.5
@@ -89,6 +94,20 @@ def template_of(subject: mi.Shape, surface: Surface, *, like: Template | None = 
         excess = mesh.interpolate(mi.Float(surface.hull)).numpy()
         start = back_on_solid(vertices, faces, np.where(logits > 0, subject.length_scale * excess, 0))
     return Template(mesh, vertices, faces, logits, start)
+
+
+def preview_of(fit: Fit, surface: Surface) -> Preview:
+    """A surface between two stages, where stages have moved its template to, all in grey."""
+    subject = fit.scene.subject
+    if surface.moved or surface.hull is not None:
+        template = template_of(subject, surface)
+        at, faces = surface.moved[0].positions if surface.moved else template.start, template.faces
+        vertices, kept = positive_part(at, faces, template.logits)
+    else:
+        (vertices, kept), (at, faces) = (
+            subject.surface_of(surface.fields, template=closed).to_numpy()[:2] for closed in (False, True)
+        )
+    return Preview(vertices, kept, np.full(vertices.shape, _GREY), at, faces)
 
 
 def lattice_index(points: np.ndarray, to_world: mi.ScalarTransform4f, side: int) -> np.ndarray:

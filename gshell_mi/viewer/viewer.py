@@ -157,6 +157,15 @@ class Viewer:
         end = time.monotonic()
         self._due = end + max(_INTERVAL, (end - begin) / _SHARE)
 
+    def stage_done(self, stage: str, preview: Callable[[], Preview]) -> None:
+        """Shows what a stage has left that makes no steps; of others, steps have been shown."""
+        if stage == self._stage:
+            return
+        self._stage, self._due, self._losses = stage, 0.0, []
+        self._show(preview())
+        self._status.content = f"**{stage}** is done."
+        self._server.flush()
+
     # --- the scene
 
     def _show(self, preview: Preview) -> None:

@@ -8,6 +8,9 @@ from .trials import Outcome
 #: Figures that are shown with the truth's.
 _OF_THE_TRUTH = ("boundary_loops", "components")
 
+#: Figures of the mesh that tell what a stage has done to it.
+_OF_STAGES = ("boundary_loops", "pinholes", "components", "rim", "chamfer", "f_score")
+
 LEGEND = """\
 Loops and components are *found / true*; a boundary shorter than 5 % of the diagonal is a pin-hole and no
 loop. *Rim* is the length of all boundaries over that of the truth. Chamfer is the mean of both directions in
@@ -38,6 +41,22 @@ def table(rows: list[tuple[str | None, str, Outcome | None]], first: str) -> str
         lines.append(f"| {label} | {' | '.join(_cells(outcome))} |")
     if marked:
         lines += ["", "† Fitted with another version of the code than the first row."]
+    return "\n".join(lines) + "\n"
+
+
+def stages_table(outcome: Outcome) -> str:
+    """A table of the surface after each of a fit's stages; empty if that was not kept."""
+    if not outcome.stages:
+        return ""
+    titles = [FIGURES[name].title for name in _OF_STAGES]
+    lines = [f"| after | s | {' | '.join(titles)} |", "|---" * (len(titles) + 2) + "|"]
+    before = None
+    for stage, told in outcome.stages.items():
+        cells = ["same"] + [""] * (len(titles) - 1)
+        if told["mesh"] != before:
+            cells = [_cell(name, told) for name in _OF_STAGES]
+        lines.append(f"| *{stage}* | {told['seconds']:.0f} | {' | '.join(cells)} |")
+        before = told["mesh"]
     return "\n".join(lines) + "\n"
 
 

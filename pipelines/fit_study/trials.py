@@ -22,6 +22,8 @@ from gshell_mi.fit import FitConfig, fit_scene
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
 from gshell_mi.scene import render_missing_targets
 
+from .stage_scores import StageScores
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -57,6 +59,8 @@ class Outcome:
     """``code_version`` of the package that made the fit."""
     error: str | None = None
     """Why there is no surface to score."""
+    stages: dict = dataclasses.field(default_factory=dict)
+    """By stage, in their order: ``seconds`` and the ``mesh`` scores after it; empty if it was interrupted."""
 
 
 def load_outcome(trial: Trial, output: Path) -> Outcome | None:
@@ -91,6 +95,7 @@ def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
     if trial.truth is None:
         _render_views(inside / "reference.xml", trial.scene, inside)
     code, before = code_version(), time.process_time()
+    watcher = StageScores(inside / "truth.ply")
     try:
         fitted = fit_scene(
             trial.scene,
@@ -100,8 +105,9 @@ def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
             overwrite=not resume,
             report=False,
             quiet=quiet,
+            observer=watcher,
         )
-        seconds = time.process_time() - before
+        seconds = time.process_time() - before - watcher.cpu_seconds
         targets = inside / "test"
         if not targets.is_dir():
             targets = output / trial.scene.stem / "test_views"
@@ -113,6 +119,7 @@ def run_trial(trial: Trial, output: Path, *, quiet: bool = True) -> Outcome:
             None if resume else round(seconds, 1),
             fitted.metrics["seconds"]["total"],
             code,
+            stages={} if resume else watcher.with_seconds(fitted.metrics["seconds"]),
         )
     except UserError as error:
         outcome = Outcome(_plain(trial.config), {}, None, 0.0, code, str(error))

@@ -35,11 +35,15 @@ def scene(bowl_scene):
 
 
 def _verdict(scene, before, after, spoil=lambda rgba: rgba) -> Verdict:
+    """Of the rays that meet the lid: half of the views see nothing of it."""
     views = PinholeViews.from_sensors(scene.sensors)
     targets = [
         dataclasses.replace(target, rgba=spoil(target.rgba).astype(np.float32)) for target in scene.targets
     ]
-    return Judge(views, targets, Judge.halves(len(views)), batch=16384).decide(before, after)
+    judge = Judge(views, targets, Judge.halves(len(views)), batch=16384)
+    lid = np.arange(len(_with_lid()[0])) >= len(_bowl()[0])
+    shown = [judge.shown(mesh).whole for mesh in (before, after)]
+    return judge.compare(*shown, np.where(lid, 0, -1), judge.shown(_with_lid()))
 
 
 def test_an_opening_that_is_there_is_accepted_and_a_lid_rejected(scene):
@@ -96,7 +100,7 @@ def test_few_views_are_not_enough():
 
 def _told(z: list[float], rejected: int = 0) -> list[bool]:
     gain = 0.1 * np.array(z)
-    return Verdict(gain, gain, gain, np.full(len(z), 0.1), rejected).accepted.tolist()
+    return Verdict(gain, gain, gain, np.full(len(z), 0.1), rejected=rejected).accepted.tolist()
 
 
 def test_of_many_places_the_best_by_chance_is_not_accepted():
@@ -110,6 +114,17 @@ def test_what_was_rejected_before_counts():
     assert _told([2.1]) == [True]
     assert _told([2.1], rejected=23) == [False]
     assert _told([3.2], rejected=23) == [True]
+
+
+@pytest.mark.parametrize("views", [4, 8, 48])
+def test_few_views_do_not_accept_by_chance_more_often(views):
+    """What changes nothing is accepted as often as a normal variate is above two."""
+    count, rng = 20_000, np.random.default_rng(0)
+    rays = np.full((count, views), 100.0)
+    verdict = verdict_of(rays, 1000 * np.exp(0.1 * rng.normal(size=rays.shape)), np.full(rays.shape, 1000.0))
+    assert verdict.views == pytest.approx(views)
+    accepted = np.mean([verdict.at(slice(place, place + 1)).accepted[0] for place in range(count)])
+    assert accepted == pytest.approx(0.0228, abs=0.004)
 
 
 def test_many_places_that_are_all_better_are_all_accepted():

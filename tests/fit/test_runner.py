@@ -54,10 +54,13 @@ class Watcher:
     """An observer that keeps what it is told."""
 
     def __init__(self):
-        self.told = []
+        self.told, self.done = [], []
 
     def step(self, stage, iteration, count, values, preview):
         self.told.append((stage, iteration, count, values["loss"]))
+
+    def stage_done(self, stage, preview):
+        self.done.append(stage)
 
 
 def run(folder, stages, checkpoint=None, watcher=None) -> tuple[Surface, Checkpoint]:
@@ -85,6 +88,7 @@ def test_steps_done_again_go_on_in_the_log_and_for_the_observer(tmp_path):
     run(tmp_path, [Rises("first", again=True)], watcher=watcher)
     assert log(tmp_path) == [("first", i, 10 + i % COUNT) for i in range(2 * COUNT)]
     assert watcher.told[COUNT:] == [("first", COUNT + i, 2 * COUNT, 10 + i) for i in range(COUNT)]
+    assert watcher.done == ["first"]
 
 
 def test_a_fit_goes_on_where_it_was_stopped(tmp_path, monkeypatch):

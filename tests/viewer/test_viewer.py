@@ -91,6 +91,15 @@ def test_it_takes_little_of_the_time(viewer):
     assert look.asked == 3, "a new stage shows at once"
 
 
+def test_it_shows_what_stages_leave_that_make_no_steps(viewer):
+    look = _Counted()
+    viewer.stage_done("hull", look)
+    assert look.asked == 1
+    viewer.step("joint", 0, 1, {"loss": 1.0, "psnr": 10.0}, look)
+    viewer.stage_done("joint", look)
+    assert look.asked == 2, "its last step has been shown"
+
+
 def test_a_port_that_is_taken(viewer):
     port = int(viewer.url.rpartition(":")[2])
     with Viewer(port=port) as second:
@@ -130,7 +139,7 @@ def test_of_a_whole_fit(bowl_scene, tmp_path, capfd, monkeypatch):
     options += ["--quiet", "--viewer", "--viewer-port", "0"]
     assert main([str(bowl_scene), "-o", str(tmp_path / "out"), *options]) == 0
     assert "live view: http://localhost:" in capfd.readouterr().err
-    assert set(seen) == {"openings", "cavities", "refinement", "joint"}
+    assert {"hull", "openings", "cavities", "refinement", "revoxelise", "joint"} <= set(seen)
     for found in seen.values():
         assert found.faces.max() < len(found.vertices) == len(found.colors)
         assert np.linalg.norm(found.vertices, axis=1).max() < 1 and len(found.faces) > 100

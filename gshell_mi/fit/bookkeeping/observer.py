@@ -24,3 +24,6 @@ class Observer(Protocol):
             values: the losses and ``psnr`` of the step.
             preview: takes what is there out of the optimisers, some milliseconds; call it rarely.
         """
+
+    def stage_done(self, stage: str, preview: Callable[[], Preview]) -> None:
+        """After each stage; ``preview`` makes what it has left, in one colour."""

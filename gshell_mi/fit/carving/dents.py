@@ -41,7 +41,7 @@ def without_dents(fit: Fit, surface: Surface) -> tuple[Surface, Verdict | None]:
         The surface, the given one if no dent goes, and what the judge says of each dent.
     """
     blocks, whole = surface.fields.blocks is not None, surface.whole()
-    lattice, verdicts = whole.lattice, []
+    lattice, judge, verdicts = whole.lattice, fit.outline_judge, []
     if lattice.vertex_count != lattice.stride**3:
         return surface, None
     filled, shown = whole, None
@@ -57,9 +57,9 @@ def without_dents(fit: Fit, surface: Surface) -> tuple[Surface, Verdict | None]:
         moved = (near > 0) & (ndimage.map_coordinates(distance, index, order=1) > _MOVED)
         if not moved.any():
             continue
-        shown = shown or fit.judge.shown(fit.mesh(filled))
-        other = fit.judge.shown(after, like=shown)
-        verdict = fit.judge.compare(shown.whole, other.whole, places_of(moved, near), other)
+        shown = shown or judge.shown(fit.mesh(filled))
+        other = judge.shown(after, like=shown)
+        verdict = judge.compare(shown.whole, other.whole, places_of(moved, near), other)
         verdicts.append(verdict)
         better = np.unique(near[moved])[verdict.accepted]
         if len(better):

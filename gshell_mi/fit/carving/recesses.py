@@ -31,7 +31,7 @@ def sunk(fit: Fit, template: Shown, values: np.ndarray, proposed: np.ndarray, ce
         proposed: (V,) opacity logits.
         cell: side of a lattice cell, world units.
     """
-    (vertices, faces), judge = template.mesh, fit.judge
+    (vertices, faces), judge = template.mesh, fit.outline_judge
     for level in LEVELS:
         logits = clean_opacity(
             np.where(values > 0, proposed - level, values), vertices, faces, fit.config.topology.min_area

@@ -54,19 +54,20 @@ class Revision:
         """The surface with other openings, if there are any."""
         cell, (template, values) = fit.cell(surface), cut_template(fit, surface)
         vertices, faces, _ = template.to_numpy()
-        now = fit.judge.shown(positive_part(vertices, faces, values))
+        judge = fit.outline_judge
+        now = judge.shown(positive_part(vertices, faces, values))
         proposed = proposals(fit, now, (vertices, faces), self.config, steps)
         with steps.task("verdict"):
             thickness, opposite = opposite_sides(vertices, vertices, faces, cell)
             thin = np.isfinite(thickness)
             smooth = least_bent(vertices, faces, (values <= 0) & ~thin)
             revised = _closed(
-                fit.judge, fit.judge.shown((smooth, faces), like=now), values, np.where(thin, opposite, -1)
+                judge, judge.shown((smooth, faces), like=now), values, np.where(thin, opposite, -1)
             )
             capped = (values <= 0) & (revised > 0)
             moved = np.where(capped[:, None], smooth, vertices)
-            shown = fit.judge.shown((moved, faces), like=now)
-            revised = _with_islands(fit.judge, shown, revised, proposed)
+            shown = judge.shown((moved, faces), like=now)
+            revised = _with_islands(judge, shown, revised, proposed)
             revised, shown = _opened(fit, shown, revised, proposed, cell)
             recessed = sunk(fit, shown, revised, proposed, cell)
             deeper = (recessed != moved).any(axis=1)
@@ -194,13 +195,13 @@ def _opened(
     Returns:
         (V,) values, negative also at new openings; the template, where recesses have come.
     """
-    vertices, faces = template.mesh
+    (vertices, faces), judge = template.mesh, fit.outline_judge
     given, now = values <= 0, template.part(values)
     standing = islands(~given, faces)[0]
 
     def judged(candidate: np.ndarray) -> np.ndarray:
-        kept = close_rejected(candidate, template, fit.judge, now, given)
-        return open_rejected(kept, template, fit.judge, standing)
+        kept = close_rejected(candidate, template, judge, now, given)
+        return open_rejected(kept, template, judge, standing)
 
     values = further_openings(template.mesh, values, proposed, fit.config.topology.min_area, judged)
     opened = (values <= 0) & ~given
@@ -209,11 +210,11 @@ def _opened(
     place = places_of(opened, lobes(opened, faces))
     recesses = Recesses(vertices, faces, place, HELD * cell)
     closed = np.where(opened, -values, values)
-    depth, least = recess_depths(fit.judge, template, recesses, closed, values, place, cell)
+    depth, least = recess_depths(judge, template, recesses, closed, values, place, cell)
     values = np.where(opened & ~(least > 0)[place], -values, values)
     depth[least > 0] = 0
     # Each was judged beside others that may have come out otherwise.
-    together = fit.judge.shown((recesses.at(depth), faces), like=template).part(values)
-    better = fit.judge.compare(now, together, place, template).gain > 0
+    together = judge.shown((recesses.at(depth), faces), like=template).part(values)
+    better = judge.compare(now, together, place, template).gain > 0
     recessed = recesses.at(np.where(better, depth, 0)), faces
-    return np.where(opened & ~better[place], closed, values), fit.judge.shown(recessed, like=template)
+    return np.where(opened & ~better[place], closed, values), judge.shown(recessed, like=template)

@@ -36,16 +36,17 @@ class Rims:
         given = values <= 0
         if not given.any() or given.all():
             return surface
-        now = fit.judge.shown(positive_part(vertices, faces, values))
+        judge = fit.outline_judge
+        now = judge.shown(positive_part(vertices, faces, values))
         proposed = proposals(fit, now, (vertices, faces), self.config, steps)
         with steps.task("verdict"):
-            closed = fit.judge.shown((vertices, faces), like=now)
+            closed = judge.shown((vertices, faces), like=now)
             before = closed.part(values)
 
             def judged(candidate: np.ndarray) -> np.ndarray:
                 growth = grown(candidate <= 0, given, faces)
                 logits = np.where(growth | given, candidate, np.abs(candidate))
-                return close_rejected(logits, closed, fit.judge, before, given)
+                return close_rejected(logits, closed, judge, before, given)
 
             min_area = fit.config.topology.min_area
             opened = further_openings(closed.mesh, values, proposed, min_area, judged) <= 0

@@ -161,7 +161,7 @@ def test_what_is_filled_sinks_where_something_is_proposed():
     lid = (vertices[:, 1] > HALF - 1e-6) & (np.abs(vertices[:, [0, 2]]) < HALF - WALL).all(axis=1)
     wall = (vertices[:, 0] > HALF - 1e-6) & (np.abs(vertices[:, 1:]) < HALF - WALL).all(axis=1)
     template, closed = judge.shown((vertices, faces)), np.ones(len(vertices))
-    fit = SimpleNamespace(judge=judge, config=config)
+    fit = SimpleNamespace(outline_judge=judge, config=config)
     moved = sunk(fit, template, closed, np.where(lid | wall, -1.0, 1.0), side)
     assert moved[lid, 1].min() == pytest.approx(0, abs=0.15)
     np.testing.assert_array_equal(moved[~lid], vertices[~lid])
