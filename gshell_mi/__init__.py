@@ -2,15 +2,16 @@
 
 The rooms, in the order in which data flows through them:
 
-- ``lattice``, ``sign_scan``, ``block_lattice``, ``fields``, ``extraction``: from signed distances on a
-  lattice, or on its blocks around the surface, to a triangle mesh
+- ``lattice``, ``fields``, ``extraction``: from signed distances on a lattice, or on its blocks around the
+  surface, to a triangle mesh
 - ``conversion``: from a triangle mesh back to such distances
 - ``shape``: the same as a Mitsuba shape, ``{"type": "gshell"}``
 - ``integrators``: rendering with right derivatives, ``{"type": "gshell_path"}`` and ``gshell_mask``
-- ``capture``: photographs with known cameras become a fit scene, ``python -m gshell_mi.capture``
+- ``capture``: photographs or a video become a fit scene, ``python -m gshell_mi.capture``
 - ``targets``, ``views``, ``scene``: what a fit starts from
 - ``parametrisation``: what an optimiser changes in place of the lattice fields
 - ``template``: what can be done to a watertight surface and the mSDF that cuts it
+- ``radiance``, ``calibration``: what images say of a surface before it has a material, and of the cameras
 - ``activations``, ``losses``, ``material``, ``light``, ``fit``: the optimisation, ``python -m gshell_mi.fit``
 - ``extras``: losses and parametrisations that it knows by name and leaves out by default
 - ``viewer``: a look at it while it runs, ``--viewer``

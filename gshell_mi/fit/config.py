@@ -28,7 +28,8 @@ class LatticeConfig:
     """How fine lattices are, and how their fields are stored."""
 
     start_resolution: Annotated[int, Between(4)] = 64
-    """Cells per side, at most, up to the detail stage. Unused if the scene gives the fields."""
+    """Cells per side, at most, up to the detail stage, unless a radiance volume is the start. Unused if the
+    scene gives the fields."""
     band_resolution: Annotated[int, Between(4)] = 128
     """From this resolution on the joint stage stores its fields in blocks around the surface."""
 

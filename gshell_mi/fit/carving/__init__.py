@@ -1,1 +1,1 @@
-"""Hollows: what a radiance volume in the hull, or walls behind openings, show of what the hull bridges."""
+"""Where the surface is deeper than it was, as in hollows, vessels and recesses, or less deep, as in dents."""

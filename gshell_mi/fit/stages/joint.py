@@ -1,8 +1,8 @@
 """Joint and detail stage: geometry, material and light by differentiable path tracing.
 
 The joint stage works on a lattice of few cells, as a step moves a surface by a fraction of a cell; the detail
-stage goes on from there on the lattice that the fit ends on. Both move the rims of openings;
-which openings there are is asked again between them (``revision``).
+stage goes on from there on the lattice that the fit ends on. Both move the rims of openings; which openings
+there are is asked again between them (``revision``), and where they end after both (``rims``).
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ class DetailConfig(JointConfig):
 
     iterations: int = 60
     """Steps of the detail stage, which continues the joint stage on a lattice finer than
-    --lattice.start-resolution; 0 runs the joint stage itself on that lattice."""
+    --lattice.start-resolution; 0 runs the joint stage itself on that lattice, and leaves out poses, revision,
+    alignment and rims."""
     warmup: Annotated[float, Between(0, 1)] = 0.0
     geometry_lr: float = 0.125
     geometry_smoothing: float = 4.0

@@ -60,7 +60,8 @@ class OpeningsConfig:
     rounds: int = 3
     """How often, at most, the steps are done again for what wrong openings have hidden."""
     revise: bool = True
-    """Ask once more when the joint stage has moved the surface; --openings.no-revise: do not."""
+    """Ask once more when the joint stage has moved the surface, and at the end how far openings reach;
+    --openings.no-revise: do neither."""
 
 
 class Openings:
