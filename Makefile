@@ -46,7 +46,7 @@ scenes: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) pipelines/make_scenes.py $(ARGS)
 
 docs: $(VENV)/.docs
-	@$(PY) -m mkdocs build --quiet --strict $(ARGS)
+	@$(PY) -m mkdocs build --strict $(ARGS)
 
 fuzz: $(VENV)/.test $(VENV)/.llvm
 	@$(PY) pipelines/fuzz.py $(ARGS)

@@ -115,7 +115,8 @@ class PixelPool:
         # One stream per step: a resumed run draws what the uninterrupted one would have drawn.
         random = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, seed), initseq=_sequence(count, step))
         most = dr.opaque(mi.UInt32, self._count - 1)
-        pixel = dr.minimum(mi.UInt32(random.next_float32() * dr.opaque(mi.Float, self._count)), most)
+        # A float has too few bits to reach every pixel of many photographs.
+        pixel = mi.UInt32((mi.UInt64(random.next_uint32()) * dr.opaque(mi.UInt64, self._count)) >> 32)
         if rays * together > 1:
             lane = dr.arange(mi.UInt32, count * together * rays)
             pixel = dr.gather(mi.UInt32, pixel, lane // (rays * together)) + (lane // rays) % together

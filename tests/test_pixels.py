@@ -1,5 +1,6 @@
 """Random pixels: which are drawn, and what a mean over them stands for."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -59,6 +60,24 @@ def test_a_mean_times_the_share_is_one_over_all_pixels(drawn):
     assert pool.share[0] * sample.alpha.numpy().mean() == pytest.approx(whole[:, 3].mean(), rel=0.02)
     assert pool.share[0] * sample.radiance.numpy()[0].mean() == pytest.approx(whole[:, 0].mean(), rel=0.02)
     assert len(sample.alpha) == round((1 << 16) * pool.share[0]), "as many to a pixel as asked for"
+
+
+def test_every_one_of_many_pixels_may_be_drawn(monkeypatch):
+    """A float has 23 random bits; a pool that says it has 2^26 pixels draws odd ones, too."""
+    pool = PixelPool(views(), [ring(*size) for size in SIZES])
+    indices = []
+    monkeypatch.setattr(pool, "_count", 1 << 26)
+    given = dr.gather
+
+    def gather(kind, source, index, *options):
+        if source is pool._view:
+            indices.append(index.numpy())
+            index = mi.UInt32(index % 100)
+        return given(kind, source, mi.UInt32(index % 100) if source is not pool._size else index, *options)
+
+    monkeypatch.setattr(dr, "gather", gather)
+    pool.sample(10_000, seed=0, step=0)
+    assert np.bincount(indices[0] % 8, minlength=8).min() > 0.8 * len(indices[0]) / 8
 
 
 def test_what_is_unknown_is_not_drawn():

@@ -88,7 +88,7 @@ class LatticeFields:
         if self.blocks is not None:
             raise UserError(
                 "fields in blocks are known near their surface only and cannot be resampled; "
-                "from_mesh makes fields of any resolution from the extracted mesh"
+                "whole() makes fields of them that are known everywhere"
             )
         old, new = self.lattice, make_lattice(grid or self.grid, resolution)
         if new == old:

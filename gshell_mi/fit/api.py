@@ -31,7 +31,7 @@ from .lattices import Lattices
 from .memory import MemoryEstimate
 from .pipeline import pipeline
 from .runner import Runner, checkpoint_path
-from .scene_checks import check_given, check_names
+from .scene_checks import check_given, check_names, notes_on_views
 from .stage import Fit
 from .surface import Surface
 
@@ -110,7 +110,7 @@ def fit_scene(
             )
         if not fit.pixels.has_alpha:
             progress.warn("some targets have no alpha: coverage is taken as 1 and the mask losses are off.")
-        for note in loaded.notes:
+        for note in loaded.notes + notes_on_views(loaded):
             progress.warn(note)
         # Nothing is written before all is known to be in order.
         folder.prepare()

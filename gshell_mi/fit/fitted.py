@@ -27,14 +27,12 @@ class Fitted:
         material: on the surface's lattice.
         light: None if it is the scene's own.
         texture: (V, 3) base colours of the surface's mesh, divided ``texture_levels`` times; or None.
-        scene: of the surface under that light.
     """
 
     material: MaterialField | GivenMaterial
     light: EnvironmentLight | None
     texture: np.ndarray | None
     texture_levels: int
-    scene: mi.Scene
 
     @classmethod
     def of(cls, fit: Fit, surface: Surface) -> Fitted:
@@ -48,13 +46,7 @@ class Fitted:
             material = MaterialField(np.zeros((count, 3)), **given)
             material.parameters = {name: mi.Float(surface.model[name]) for name in material.parameters}
         light, model = start_light(fit.scene, surface, config), surface.model
-        return cls(
-            material,
-            light,
-            model.get("texture"),
-            int(model.get("texture_levels", 0)),
-            optimised_scene(fit.scene, light),
-        )
+        return cls(material, light, model.get("texture"), int(model.get("texture_levels", 0)))
 
     def findings(self, fit: Fit, warn: Callable[[str], None]) -> dict:
         """Entries of ``metrics.json``: ``diagnostics`` and, with depth maps, ``depth_error``.
@@ -69,5 +61,7 @@ class Fitted:
         for warning in found.warnings():
             warn(warning)
         metrics = {"diagnostics": dataclasses.asdict(found)}
-        error = depth_error(fit.scene, fit.views, self.scene)
-        return metrics if error is None else metrics | {"depth_error": error}
+        if any(target.depth is not None for target in fit.scene.targets):
+            error = depth_error(fit.scene, fit.views, optimised_scene(fit.scene, self.light))
+            metrics |= {} if error is None else {"depth_error": error}
+        return metrics

@@ -35,7 +35,7 @@ _EXACT = 1e-3
 _ROUNDED = 1e-6
 
 #: Views that have to tell of a place before their spread does.
-_VIEWS = 4
+FEWEST_VIEWS = 4
 
 
 @dataclass(frozen=True)
@@ -85,16 +85,19 @@ class Verdict:
     @classmethod
     def together(cls, verdicts: list[Verdict]) -> Verdict:
         """On all places of several verdicts, one after the other."""
-        each = (
-            (given.before, given.after, given.gain, given.noise, given.views + 0 * given.gain)
-            for given in verdicts
-        )
-        return cls(*(np.concatenate(values) for values in zip(*each, strict=True)))
+        columns = zip(*(given._columns for given in verdicts), strict=True)
+        before, after, gain, noise, views = (np.concatenate(column) for column in columns)
+        return cls(before, after, gain, noise, views)
 
     def at(self, places: slice) -> Verdict:
         """On some of the places, as if no others had been asked for."""
-        every = self.before, self.after, self.gain, self.noise, self.views + 0 * self.gain
-        return Verdict(*(values[places] for values in every))
+        before, after, gain, noise, views = (column[places] for column in self._columns)
+        return Verdict(before, after, gain, noise, views)
+
+    @property
+    def _columns(self) -> tuple[np.ndarray, ...]:
+        views = np.broadcast_to(self.views, self.gain.shape)
+        return self.before, self.after, self.gain, self.noise, views
 
     def facts(self) -> dict[str, list[float | None]]:
         """For ``metrics.json``: gain and noise of each place; no noise where hardly a view tells."""
@@ -321,7 +324,7 @@ def verdict_of(rays: np.ndarray, before: np.ndarray, after: np.ndarray) -> Verdi
     gain = (weight * change).sum(axis=-1) / voices
     spread = (weight**2 * (change - gain[..., None]) ** 2).sum(axis=-1)
     noise = np.sqrt(spread * seen / np.maximum(seen - 1, 1)) / voices + _ROUNDED
-    noise[:, seen < _VIEWS] = np.inf
+    noise[:, seen < FEWEST_VIEWS] = np.inf
     # The scale that tells more of a place speaks for it.
     scale = np.argmax(np.abs(gain) / noise, axis=0)[None]
     gain, noise = (np.take_along_axis(values, scale, axis=0)[0] for values in (gain, noise))

@@ -72,7 +72,7 @@ class MemoryEstimate:
         True
         """
         # Fields in blocks follow the surface.
-        whole = resolution
+        whole, early = resolution, min(resolution, config.lattice.start_resolution)
         moves = parametrisation_named(config.model.field).moves_weights
         weights = make_lattice(grid, resolution).weight_count if moves else 0
         if resolution >= config.lattice.band_resolution and make_lattice(grid, 1).fits_in_blocks:
@@ -82,7 +82,7 @@ class MemoryEstimate:
         pixels = np.asarray(sizes, np.int64).prod(axis=1)
         corrected = _PER_CORRECTED if config.exposures == "find" else 0
         votes = config.hull.daylight_votes * len(pixels)
-        hull_samples = (thin_part_refinement(whole) * whole + 1) ** 3
+        hull_samples = (thin_part_refinement(early) * early + 1) ** 3
         return cls(
             program=_PROGRAM + (_ASSET if report else 0),
             hull=int((_PER_HULL_SAMPLE + _PER_VOTE * votes) * hull_samples),

@@ -40,7 +40,7 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
             *([Occlusion(config.occlusion)] if config.occlusion.most else []),  # masks that are wrong
             Hull(config.hull),  # what the masks leave
         ]
-    if config.light_frame == "find" and not (config.known_light or config.geometry_only):
+    if config.light_frame == "find" and not config.light_is_given:
         start.append(LightFrame(config.gains))  # whether the light turns with the camera
     found = config.exposures == "find" and not config.geometry_only
     exposures: list[Stage] = [Exposures(config.gains)] if found else []
@@ -71,7 +71,9 @@ def pipeline(scene: FitScene, lattices: Lattices, config: FitConfig) -> list[Sta
             Joint("joint", config.joint, config.iterations, lattices.late),  # shape, material and light
             *posed,  # corrects the cameras
             *([Revision(config.openings)] if revises else []),  # what is open after all
-            Joint("detail", config.detail, config.detail.iterations),  # the same on the last lattice
+            Joint(  # the same on the last lattice
+                "detail", config.detail, config.detail.iterations, before=config.iterations
+            ),
             *aligned,  # further, by what is better now
             *([Rims(config.openings)] if revises else []),  # where openings end
         ]

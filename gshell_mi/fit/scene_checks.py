@@ -1,4 +1,4 @@
-"""What a fit refuses before it starts."""
+"""What a fit refuses before it starts, or warns of."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from ..parametrisation import parametrisation_named
 from ..scene import FitScene
 from .config import FitConfig
 from .joint.regularisers import check_losses
+from .judge import FEWEST_VIEWS
 
 
 def check_names(config: FitConfig) -> None:
@@ -18,6 +19,16 @@ def check_names(config: FitConfig) -> None:
     """
     parametrisation_named(config.model.field)
     check_losses(config.losses)
+
+
+def notes_on_views(scene: FitScene) -> list[str]:
+    """What is hardly meant so of the training views, a sentence each; often none."""
+    if len(scene.targets) >= FEWEST_VIEWS:
+        return []
+    return [
+        f"With fewer than {FEWEST_VIEWS} training views nothing tells a true change from an accident: "
+        f"openings, hollows and moved parts of the visual hull stay as they are; give more views."
+    ]
 
 
 def check_given(scene: FitScene, config: FitConfig) -> None:
@@ -34,10 +45,11 @@ def check_given(scene: FitScene, config: FitConfig) -> None:
             f"explains the images by one environment: take it out, and its light is found as "
             f"part of that."
         )
-    if config.known_light and config.light_frame == "camera":
+    if config.light_is_given and config.light_frame == "camera":
+        mode = "--geometry-only" if config.geometry_only else "--known-light"
         raise UserError(
-            "--known-light keeps the light where the scene has it, and --light-frame camera turns it with "
-            "every view; leave one of them out."
+            f"{mode} keeps the light where the scene has it, and --light-frame camera turns it with "
+            f"every view; leave one of them out."
         )
     if scene.subject.surface.is_empty:
         raise UserError(

@@ -16,7 +16,9 @@ SURE = 0.5
 
 def with_open_sheets(fit: Fit, surface: Surface) -> Surface:
     """The surface with one side open of each small part that has closed on the way, such as an island of
-    lace."""
+    lace; as it is where nothing shall open, or both sides of sheets shall stay."""
+    if fit.config.watertight or not fit.config.topology.sheet_thickness:
+        return surface
     fields, lattice = surface.fields, surface.lattice
     template = fit.scene.subject.surface_of(fields, template=True)
     vertices, faces, _ = template.to_numpy()

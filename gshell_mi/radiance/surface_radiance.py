@@ -203,7 +203,7 @@ class SurfaceRadiance:
 
     def preview(self) -> Preview:
         """The part of the mesh that is not clearly fading, in the radiance of its front."""
-        vertices, faces = self._positions.numpy().reshape(-1, 3), self._faces.numpy().reshape(-1, 3)
+        vertices, faces = self._positions.numpy().reshape(-1, 3), self._faces.numpy().T
         kept = dr.detach(self.optimizer["opacity"]).numpy() > 2 * _INITIAL_LOGIT
         return Preview(vertices, faces[kept[faces].all(axis=1)], self.radiance()[0], vertices, faces)
 

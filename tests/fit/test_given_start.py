@@ -9,6 +9,7 @@ from gshell_mi import TetLattice, make_lattice
 from gshell_mi.fields import LatticeFields
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
+from gshell_mi.fit.stages.hull import Given
 from gshell_mi.light import EnvironmentLight
 from gshell_mi.material import given_material
 
@@ -52,6 +53,16 @@ def test_fields_of_the_scene_are_the_start(grid, tmp_path):
         np.broadcast_to([0.2, 0.4, 0.6], (len(positions), 3)),
         atol=1e-3,
     )
+
+
+def test_fields_in_blocks_are_a_start(tmp_path):
+    subject = mi.load_dict({"type": "gshell", "resolution": RESOLUTION})
+    points = subject.lattice.vertex_positions()
+    fine = make_lattice("tet", 4 * RESOLUTION)
+    sdf = np.linalg.norm(fine.vertex_positions(), axis=1) - 0.6
+    found = Given._on(TetLattice(RESOLUTION), LatticeFields.closed(sdf).in_blocks())
+    near = np.abs(np.linalg.norm(points, axis=1) - 0.6) < 0.1
+    np.testing.assert_allclose(found.sdf[near], np.linalg.norm(points[near], axis=1) - 0.6, atol=0.01)
 
 
 def test_only_a_principled_bsdf_gives_a_material():

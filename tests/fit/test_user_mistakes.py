@@ -339,10 +339,9 @@ def test_smoothing_and_rates_of_0_switch_off(bowl_scene, tmp_path):
     assert np.isfinite(losses).all()
 
 
-def test_a_known_light_does_not_turn(told):
-    assert "--known-light keeps the light where the scene has it" in told(
-        "--known-light", "--light-frame", "camera"
-    )
+@pytest.mark.parametrize("mode", ["--known-light", "--geometry-only"])
+def test_a_known_light_does_not_turn(told, mode):
+    assert f"{mode} keeps the light where the scene has it" in told(mode, "--light-frame", "camera")
 
 
 def test_no_surface_left(told, scene, tmp_path):

@@ -92,6 +92,12 @@ def test_a_miss_is_transparent(sheets):
     assert alpha == 0 and not radiance.any()
 
 
+def test_a_preview_is_of_its_triangles(sheets):
+    preview = sheets.preview()
+    np.testing.assert_array_equal(preview.template_faces, two_sheets()[1])
+    np.testing.assert_allclose(preview.vertices, two_sheets()[0])
+
+
 def test_what_no_ray_meets_keeps_its_radiance():
     vertices, faces = two_sheets()
     appearance = SurfaceRadiance(vertices - [0, 0, 5], faces, *unused_views(), CONFIG)

@@ -14,7 +14,7 @@ from ...template.msdf import CERTAIN, clean_opacity, msdf_from_template, without
 from ...topology import topology
 from ...triangles import positive_part
 from ..acceptance import close_rejected
-from ..radiance_on_template import fitted_radiance
+from ..appearance import fitted_radiance
 from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import Template, at_nearest, lattice_index, template_of
@@ -79,7 +79,7 @@ def carve(fit: Fit, surface: Surface, volume: RadianceVolume) -> Surface | None:
         justified = close_rejected(proposed, closed, fit.judge, closed.whole)
         # Those that there were have been judged, and a close call may come out otherwise now.
         cleaned = clean(np.where(cleaned > 0, justified, proposed))
-    radiance = fitted_radiance(after, fit).radiance()[0]
+    radiance = fitted_radiance(fit, after).radiance()[0]
     msdf = without_specks(msdf_from_template(cleaned, after.mesh, lattice), after.mesh, lattice, min_area)
     seen = Seen.on(lattice, after.mesh, radiance, surface.sight.light)
     return replace(carved.with_fields(msdf=msdf.numpy()), seen=seen)

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from ...radiance.shown import Shown
 from ...template.msdf import CERTAIN, msdf_from_template
 from ...topology import equal_patches
-from ..radiance_on_template import fitted_radiance
+from ..appearance import fitted_radiance
 from ..stage import Fit
 from ..surface import Seen, Surface
 from ..template import Template, template_of
@@ -55,7 +55,7 @@ def hollowed_vessels(fit: Fit, surface: Surface) -> Surface | None:
     if vessel is None:
         return None
     carved, lattice = vessel.template, surface.lattice
-    front, _ = fitted_radiance(carved, fit).radiance()
+    front, _ = fitted_radiance(fit, carved).radiance()
     msdf = msdf_from_template(carved.logits, carved.mesh, lattice)
     seen = Seen.on(lattice, carved.mesh, front, surface.sight.light)
     return replace(vessel.surface.with_fields(msdf=msdf.numpy()), seen=seen)

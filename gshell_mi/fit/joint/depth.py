@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...errors import UserError
+from ...pixels import COVERED
 from ...scene import FitScene
 from ...views import PinholeViews
 
@@ -49,6 +50,6 @@ def depth_error(given: FitScene, views: PinholeViews, scene: mi.Scene) -> float 
         found = hit.is_valid() & (hit.shape == mi.ShapePtr(given.subject))
         distance = np.where(found.numpy(), hit.t.numpy(), 0)
         known = target.depth.ravel()
-        both = (known > 0) & (distance > 0)
+        both = (known > 0) & (distance > 0) & (np.asarray(target.known).ravel() > COVERED)
         errors.append(np.abs(distance - known)[both])
     return float(np.median(np.concatenate(errors))) if errors and sum(map(len, errors)) else None

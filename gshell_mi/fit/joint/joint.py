@@ -55,6 +55,7 @@ class JointStage:
         stage: settings of the stage; default: those of the joint stage.
         name: of the stage.
         iterations: its steps; default: those of the joint stage.
+        before: steps of stages whose random numbers those of this one follow.
         turns: (N, 3, 3) how the light has turned in each view; None if it stays.
     """
 
@@ -68,11 +69,13 @@ class JointStage:
         stage: JointConfig | None = None,
         name: str = "joint",
         iterations: int | None = None,
+        before: int = 0,
         turns: np.ndarray | None = None,
     ):
         self.given, self.material, self.light, self.config = given, material, light, config
         self.stage, self.name = stage or config.joint, name
         self.iterations = config.iterations if iterations is None else iterations
+        self._before = before
         self.subject = given.subject
         self.subject.set_bsdf(mi.load_dict(principled()))
         for name, field in material.values().items():
@@ -191,7 +194,7 @@ class JointStage:
 
     def seed(self, iteration: int, turn: int = 0) -> int:
         """Of the samples of a step's view; the next number is that of its gradient's."""
-        turn += iteration * self.config.render.views
+        turn += (self._before + iteration) * self.config.render.views
         return (self.config.seed * _SEEDS_APART + 2 * turn) % 2**32
 
     def finish(self) -> None:
@@ -224,8 +227,9 @@ class JointStage:
 
     def _views(self, iteration: int) -> list[int]:
         """Those of a step: every view once per round, in an order that depends on seed and round alone."""
-        count, views = len(self.given.sensors), []
-        for turn in range(iteration * self.config.render.views, (iteration + 1) * self.config.render.views):
+        count, views, each = len(self.given.sensors), [], self.config.render.views
+        first = (self._before + iteration) * each
+        for turn in range(first, first + each):
             order = np.random.default_rng((self.config.seed, turn // count)).permutation(count)
             views.append(int(order[turn % count]))
         return views

@@ -17,6 +17,7 @@ from ...extraction.surface_mesh import SurfaceMesh
 from ...light import EnvironmentLight
 from ...material import GivenMaterial, MaterialField
 from ...means import mean
+from ...pixels import COVERED
 from ...scene import FitScene
 from ...views import PinholeViews
 from ...visibility import is_visible
@@ -141,6 +142,11 @@ class StepView:
         return mi.Float(self.given.targets[self.view].rgba[..., 3].ravel())
 
     @property
+    def known(self) -> mi.Bool:
+        """Which of the view's pixels are known as a whole."""
+        return mi.Float(np.float32(self.given.targets[self.view].known).ravel()) > COVERED
+
+    @property
     def color(self) -> mi.Color3f:
         """The view's target."""
         return mi.Color3f(np.ascontiguousarray(self.given.targets[self.view].rgba[..., :3].reshape(-1, 3).T))
@@ -191,14 +197,14 @@ def _depth(step: StepView) -> mi.Float:
     target = step.given.targets[step.view]
     if target.depth is None:
         return mi.Float(0)
-    known = mi.Float(target.depth.ravel())
+    distance = mi.Float(target.depth.ravel())
     ray, hit = step.first_hits
     interaction = hit.compute_surface_interaction(ray, mi.RayFlags.All)
     # Where a pixel is covered in part, its depth is a mixture of two surfaces.
-    valid = step.on_subject(hit) & (known > 0) & (step.alpha > _WHOLE)
+    valid = step.on_subject(hit) & (distance > 0) & (step.alpha > _WHOLE) & step.known
     # From the measured point to the tangent plane: at grazing angles a small step changes depth a lot.
     scale = dr.abs(dr.dot(dr.detach(interaction.n), ray.d)) / step.subject.cell_size
-    return losses.depth_l1(dr.select(valid, interaction.t * scale, 0), known * scale, valid, _DEPTH_LIMIT)
+    return losses.depth_l1(dr.select(valid, interaction.t * scale, 0), distance * scale, valid, _DEPTH_LIMIT)
 
 
 @register_loss("flexicubes_deviation", needs="cubes")

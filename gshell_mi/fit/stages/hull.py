@@ -118,4 +118,4 @@ class Given:
 
     @staticmethod
     def _on(lattice: Lattice, fields: LatticeFields) -> LatticeFields:
-        return fields.to_lattice(lattice.resolution, lattice.grid)
+        return fields.whole().to_lattice(lattice.resolution, lattice.grid)

@@ -91,12 +91,22 @@ class Joint:
         name: of the stage.
         config: its settings.
         iterations: its steps.
+        before: steps of the stages before it that move everything, too.
         lattice: to work on, unless the surface is on a finer one; None for the one that the fit ends on, with
             nothing to do if the surface is on that already, and settled.
     """
 
-    def __init__(self, name: str, config: JointConfig, iterations: int, lattice: Lattice | None = None):
+    def __init__(
+        self,
+        name: str,
+        config: JointConfig,
+        iterations: int,
+        lattice: Lattice | None = None,
+        *,
+        before: int = 0,
+    ):
         self.name, self.config, self.iterations, self.lattice = name, config, iterations, lattice
+        self.before = before
 
     def run(self, fit: Fit, surface: Surface, steps: Steps) -> Surface:
         """The surface with material and light."""
@@ -116,6 +126,7 @@ class Joint:
             stage=self.config,
             name=self.name,
             iterations=self.iterations,
+            before=self.before,
             turns=fit.views.turns,
         )
         if joint.geometry.fitting_steps and not steps.done:

@@ -29,6 +29,7 @@ from ...schedules import decay_at
 from ...template.msdf import clean_opacity, msdf_from_template
 from ...template.sides import THIN
 from ..acceptance import LEVELS, close_rejected, close_shallow, open_rejected
+from ..appearance import radiance_on
 from ..judge import Judge
 from ..runner import Steps
 from ..stage import Fit
@@ -78,15 +79,7 @@ class Openings:
         template = template_of(fit.scene.subject, whole)
         vertices, faces, count = template.vertices, template.faces, self.config.iterations
         closed = fit.judge.shown(template.closed)
-        appearance = SurfaceRadiance(
-            template.start,
-            faces,
-            fit.views,
-            fit.pixels,
-            fit.config.radiance,
-            seed=fit.config.seed,
-            mirrored=closed.mirrored,
-        )
+        appearance = radiance_on(fit, template.closed, closed)
         training = OpacityTraining(appearance, self.config)
         if not fit.config.watertight:
             steps.run(training, count, {"radiance": appearance.optimizer})

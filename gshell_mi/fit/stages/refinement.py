@@ -16,7 +16,7 @@ import numpy as np
 from ...radiance.surface_radiance import SurfaceRadiance
 from ...template.outlines import Outlines
 from ...triangles import positive_part
-from ..radiance_on_template import radiance_on
+from ..appearance import training_radiance
 from ..refinement.early_stopping import EarlyStopping
 from ..refinement.refinement import PhotometricRefinement
 from ..runner import Steps
@@ -78,7 +78,7 @@ class Refinement:
             return surface
         steps.fact(f"{self.name}_kept", False)
         template = template_of(fit.scene.subject, surface)
-        start, appearance = template.start, radiance_on(template, fit)
+        start, appearance = template.start, training_radiance(fit, template)
         if self.first:
             appearance.refit_anew(template.solid)
         else:
@@ -94,10 +94,7 @@ class Refinement:
         # All views tell whether it is more than noise; those whose colours it does not know, that it is no
         # gloss.
         accepted = verdict.accepted[0] and unseen.gain[0] > 0
-        if self.first:
-            return replace(surface, moved=(after,)) if accepted else surface
-        moved = (after, *surface.moved) if accepted else (*surface.moved, after)
-        return replace(surface, moved=moved)
+        return replace(surface, moved=(after, *surface.moved)) if accepted else surface
 
     def _moved(
         self,

@@ -19,7 +19,6 @@ from scipy.spatial import cKDTree
 
 from ...extraction.surface_mesh import SurfaceMesh
 from ...radiance.shown import Mesh, Shown
-from ...radiance.surface_radiance import SurfaceRadiance
 from ...template.caps import Recesses, least_bent
 from ...template.moved_parts import with_moved_parts
 from ...template.msdf import clean_opacity, reopened, rewritten, rim_diffusion
@@ -28,6 +27,7 @@ from ...template.sides import opposite_sides
 from ...topology import inner, lobes
 from ...triangles import positive_part
 from ..acceptance import close_rejected, islands, open_rejected, worst_of
+from ..appearance import radiance_on
 from ..carving.dents import without_dents
 from ..carving.recesses import recess_depths, sunk
 from ..judge import Judge, places_of
@@ -97,9 +97,7 @@ def cut_template(fit: Fit, surface: Surface) -> tuple[SurfaceMesh, np.ndarray]:
 
 def proposals(fit: Fit, now: Shown, template: Mesh, config: OpeningsConfig, steps: Steps) -> np.ndarray:
     """(V,) opacity logits of a closed template, of a radiance that mirrors what the surface ``now`` does."""
-    appearance = SurfaceRadiance(
-        *template, fit.views, fit.pixels, fit.config.radiance, seed=fit.config.seed, mirrored=now.mirrored
-    )
+    appearance = radiance_on(fit, template, now)
     optimizers = {"radiance": appearance.optimizer}
     steps.run(OpacityTraining(appearance, config), config.iterations, optimizers)
     return appearance.smoothed_logits()

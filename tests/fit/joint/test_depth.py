@@ -135,6 +135,17 @@ def test_the_loss_is_the_difference_in_cells(scene):
     assert error == pytest.approx(0.05 * 2**0.5, abs=0.005)
 
 
+def test_what_is_unknown_has_no_depth(scene):
+    fit = load_fit_scene(scene)
+    views = PinholeViews.from_sensors(fit.sensors)
+    targets = [target.ignoring(np.ones(target.rgba.shape[:2], bool)) for target in fit.targets]
+    fit = replace(fit, targets=targets)
+    joint = stage(fit, RADIUS - 0.05)
+    joint.apply(geometry=True)
+    assert joint._regularisers([8])[1]["depth"][0] == 0
+    assert depth_error(fit, views, joint.scene) is None
+
+
 def test_the_derivative_moves_the_surface_towards_the_map(scene):
     """A mean of differences in cells falls by 1 / 0.1 per unit of radius."""
     fit = load_fit_scene(scene)
