@@ -150,26 +150,34 @@ class Alignment:
     def verdicts(self, kinds: Sequence[Sequence[Evidence]]) -> tuple[Verdict, Verdict]:
         """Whether steps are worth it: what one half of each image asks for has to explain the other half.
 
+        All kinds of evidence ask together, and each has as much of a say: gloss moves over a surface like
+        the texture of a camera that turns, and outlines deny it, which few pixels tell of.
+
         Returns:
             That on all cameras, told by the views, and that on each, told by the squares of its image: of
             many, a single one that is wrong is seen only so.
         """
         columns, rows = np.ceil(self._given.sizes.max(axis=0) / _SQUARE).astype(int)
-        rays, before, after = (np.zeros((len(self._given), columns * rows)) for _ in range(3))
-        for evidence in kinds:
-            normal = self._normal(evidence)
-            prior = normal.variance * np.diag(1 / self._spread)
-            steps = np.linalg.solve(normal.matrix + prior, normal.right[..., None])[..., 0]
-            for view, (each, residuals) in enumerate(zip(evidence, normal.residuals, strict=True)):
+        normals = [self._normal(evidence) for evidence in kinds]
+        matrix = np.sum([normal.matrix / normal.variance for normal in normals], axis=0)
+        right = np.sum([normal.right / normal.variance for normal in normals], axis=0)
+        steps = np.linalg.solve(matrix + np.diag(1 / self._spread), right[..., None])[..., 0]
+        # Of each kind: rays, and errors before and after, of the squares of each view.
+        sums = np.zeros((3, len(kinds), len(self._given), columns * rows))
+        for kind, normal in enumerate(normals):
+            for view, (each, residuals) in enumerate(zip(normal.evidence, normal.residuals, strict=True)):
                 left = residuals + (normal.jacobians[view] * steps[view, 1 - _half(each)]).sum(axis=1)
                 square = np.ravel_multi_index(tuple(_squares(each).T), (columns, rows), mode="clip")
-                for total, value in ((before, residuals), (after, left)):
-                    errors = each.weights * np.abs(value) / np.sqrt(normal.variance)
-                    total[view] += np.bincount(square, errors, columns * rows)
-                rays[view] += np.bincount(square, each.weights, columns * rows)
-        every = verdict_of(*(values.sum(axis=1)[None] for values in (rays, before, after)))
-        each = verdict_of(rays, before, after)
-        few = (rays > 0).sum(axis=1) < _SQUARES
+                scale = each.weights / np.sqrt(normal.variance)
+                for total, values in zip(
+                    sums, (each.weights, scale * np.abs(residuals), scale * np.abs(left)), strict=True
+                ):
+                    total[kind, view] = np.bincount(square, values, columns * rows)
+        typical = sums[0].sum(axis=(1, 2)) / np.maximum((sums[0] > 0).sum(axis=(1, 2)), 1)
+        sums /= np.maximum(typical, _LEAST)[:, None, None]
+        every = verdict_of(*_of_all_kinds(sums.sum(axis=3))[:, None])
+        each = verdict_of(*sums.swapaxes(1, 2).reshape(3, len(self._given), -1))
+        few = (sums[0].sum(axis=0) > 0).sum(axis=1) < _SQUARES
         return every, replace(each, noise=np.where(few, np.inf, each.noise))
 
     def _jacobian(self, evidence: Evidence, view: int) -> np.ndarray:
@@ -220,6 +228,19 @@ class Alignment:
         ]
         self._noise[kind] = max(float(np.median(squares)) / _CHI2_MEDIAN, 1.0) if squares else 1.0
         return self._noise[kind]
+
+
+def _of_all_kinds(sums: np.ndarray) -> np.ndarray:
+    """(3, N) rays, and errors before and after, of (3, K, N) those of K kinds in N views: all have one say.
+
+    >>> _of_all_kinds(np.array([[[1.0], [1.0]], [[1.0], [1.0]], [[4.0], [0.25]]])).ravel()
+    array([2., 2., 2.])
+    """
+    rays, *errors = sums
+    told, total = rays > 0, rays.sum(axis=0)
+    kinds = np.maximum(told.sum(axis=0), 1)
+    logarithms = (np.log(error / np.maximum(rays, _LEAST) + _LEAST) * told for error in errors)
+    return np.stack([total, *(total * np.exp(each.sum(axis=0) / kinds) for each in logarithms)])
 
 
 def _sums(evidence: Sequence[Evidence], values: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -9,16 +9,21 @@ than what is behind them.
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from ...radiance.shown import Mesh, Shown
 from ...topology import lobes, mesh_edges, spread
 from ...triangles import positive_part
 from ..acceptance import close_rejected, parts_with
-from ..judge import places_of
+from ..judge import Judge, places_of
 from ..runner import Steps
 from ..stage import Fit
 from ..surface import Surface
 from .openings import OpeningsConfig, further_openings
 from .revision import cut_template, opened_at, proposals
+
+#: Edges of the template by which a rim is drawn anew around what it has grown by.
+_REDRAWN = 3
 
 
 class Rims:
@@ -49,10 +54,25 @@ class Rims:
                 return close_rejected(logits, closed, judge, before, given)
 
             min_area = fit.config.topology.min_area
-            opened = further_openings(closed.mesh, values, proposed, min_area, judged) <= 0
-        moved = bool((opened & ~given).any())
-        steps.fact("rims_moved", moved)
-        return opened_at(surface, template, values, opened) if moved else surface
+            growth = (further_openings(closed.mesh, values, proposed, min_area, judged) <= 0) & ~given
+            if growth.any():
+                moved = opened_at(surface, template, values, given | growth)
+                growth &= _better(judge, closed, growth, fit.mesh(surface), fit.mesh(moved))
+        steps.fact("rims_moved", bool(growth.any()))
+        return opened_at(surface, template, values, given | growth) if growth.any() else surface
+
+
+def _better(judge: Judge, template: Shown, growth: np.ndarray, before: Mesh, after: Mesh) -> np.ndarray:
+    """(V,) at which vertices of a closed template the mesh after ``growth`` (V,) explains unseen views better
+    than the one before. The rim that is drawn is not just that of the vertices that were judged."""
+    (vertices, faces), around = template.mesh, growth
+    for _ in range(_REDRAWN):
+        around = spread(around, mesh_edges(faces)[0])
+    place = places_of(growth, lobes(growth, faces))
+    nearest = cKDTree(vertices[growth]).query(vertices)[1]
+    place = np.where(around, place[growth][nearest], -1)
+    verdict = judge.compare(judge.shown(before).whole, judge.shown(after).whole, place, template)
+    return (verdict.gain > 0)[place] & around
 
 
 def grown(opened: np.ndarray, given: np.ndarray, faces: np.ndarray) -> np.ndarray:

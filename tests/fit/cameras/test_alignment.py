@@ -117,6 +117,20 @@ def test_wrong_cameras_are_corrected(mesh, views, targets, textures):
     assert error(mesh, views, alignment.views) < 0.35
 
 
+def test_texture_that_slides_over_a_surface_is_none(mesh, views, targets):
+    """As gloss does: outlines say that the cameras are right."""
+    rng, slid = np.random.default_rng(4), []
+    for target in targets:
+        row, column = np.round(rng.uniform(-2.5, 2.5, 2)).astype(int)
+        color = np.roll(target.rgba[..., :3], (row, column), axis=(0, 1))
+        slid.append(dataclasses.replace(target, rgba=np.concatenate([color, target.rgba[..., 3:]], axis=-1)))
+    texture = Texture(mesh, slid, 6000, 0.02, 0).level(2.0, views)(views)
+    outline = Outline(mesh, slid).evidence(views)
+    assert Alignment(views, DISTANCE).verdicts([texture])[0].accepted[0]
+    every, each = Alignment(views, DISTANCE).verdicts([texture, outline])
+    assert not every.accepted[0] and not each.accepted.any()
+
+
 def test_one_camera_may_be_far_more_wrong_than_the_others(mesh, views, targets):
     """It goes most of the way, and they stay."""
     change = Corrections(np.zeros((VIEWS, 3)), np.zeros((VIEWS, 3)))
