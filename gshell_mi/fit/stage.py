@@ -85,7 +85,7 @@ class Fit:
     @cached_property
     def outline_judge(self) -> Judge:
         """Decides on changes of the surface that the joint stage leaves. It ends where masks do, to a pixel,
-        so pixels beside outlines count: without them, leaf and lace lost a strip of a cell along all rims."""
+        so pixels beside outlines count: only they tell of a strip along a rim, as of leaf and lace."""
         return self._judge(Judge.halves(len(self.views)), off_outline=0)
 
     @cached_property

@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ...radiance.shown import Mesh, Shown
-from ...topology import lobes, mesh_edges, spread
+from ...extraction.surface_mesh import SurfaceMesh
+from ...radiance.shown import Mesh
+from ...topology import lobes, mesh_edges, spread, topology
 from ...triangles import positive_part
 from ..acceptance import close_rejected, parts_with
 from ..judge import Judge, places_of
@@ -41,7 +42,7 @@ class Rims:
         given = values <= 0
         if not given.any() or given.all():
             return surface
-        judge = fit.outline_judge
+        judge = fit.judge
         now = judge.shown(positive_part(vertices, faces, values))
         proposed = proposals(fit, now, (vertices, faces), self.config, steps)
         with steps.task("verdict"):
@@ -57,22 +58,44 @@ class Rims:
             growth = (further_openings(closed.mesh, values, proposed, min_area, judged) <= 0) & ~given
             if growth.any():
                 moved = opened_at(surface, template, values, given | growth)
-                growth &= _better(judge, closed, growth, fit.mesh(surface), fit.mesh(moved))
+                denied = _denied(fit.outline_judge, closed.mesh, growth, fit.mesh(surface), fit.mesh(moved))
+                growth = _without_loops(fit, surface, template, values, growth & ~denied)
         steps.fact("rims_moved", bool(growth.any()))
         return opened_at(surface, template, values, given | growth) if growth.any() else surface
 
 
-def _better(judge: Judge, template: Shown, growth: np.ndarray, before: Mesh, after: Mesh) -> np.ndarray:
-    """(V,) at which vertices of a closed template the mesh after ``growth`` (V,) explains unseen views better
-    than the one before. The rim that is drawn is not just that of the vertices that were judged."""
-    (vertices, faces), around = template.mesh, growth
+def _denied(judge: Judge, template: Mesh, growth: np.ndarray, before: Mesh, after: Mesh) -> np.ndarray:
+    """(V,) at which vertices of a closed template the mesh after ``growth`` (V,) surely explains unseen views
+    worse than the one before. The rim that is drawn is not just that of the vertices that were judged, and
+    of a strip along a rim only pixels at outlines tell."""
+    (vertices, faces), around = template, growth
     for _ in range(_REDRAWN):
         around = spread(around, mesh_edges(faces)[0])
     place = places_of(growth, lobes(growth, faces))
     nearest = cKDTree(vertices[growth]).query(vertices)[1]
     place = np.where(around, place[growth][nearest], -1)
-    verdict = judge.compare(judge.shown(before).whole, judge.shown(after).whole, place, template)
-    return (verdict.gain > 0)[place] & around
+    verdict = judge.compare(judge.shown(before).whole, judge.shown(after).whole, place, judge.shown(template))
+    return verdict.reversed.accepted[place] & around
+
+
+def _without_loops(
+    fit: Fit, surface: Surface, template: SurfaceMesh, values: np.ndarray, growth: np.ndarray
+) -> np.ndarray:
+    """(V,) growth (V,) of the openings of a template's (V,) values that adds no loop: part by part, the
+    largest first, what becomes a hole beside them is left out."""
+
+    def loops(opened: np.ndarray) -> int:
+        return topology(*fit.mesh(opened_at(surface, template, values, opened))).boundary_loops
+
+    kept = given = values <= 0
+    most = loops(given)
+    if loops(given | growth) <= most or not growth.any():
+        return growth
+    place = places_of(growth, lobes(growth, template.to_numpy()[1]))
+    for part in np.argsort(-np.bincount(place[growth])):
+        wider = kept | (place == part)
+        kept = wider if loops(wider) <= most else kept
+    return kept & ~given
 
 
 def grown(opened: np.ndarray, given: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -8,7 +8,8 @@ from bowl import RADIUS
 from cap import cap
 from silent_steps import Silent
 
-from gshell_mi.fit.stages.rims import Rims, grown
+from gshell_mi.fit.stages.revision import cut_template
+from gshell_mi.fit.stages.rims import Rims, _without_loops, grown
 from gshell_mi.topology import topology
 
 
@@ -42,6 +43,17 @@ def test_a_rim_that_is_right_stays(exact, bowl):
     steps = Silent()
     found = Rims(exact.config.openings).run(exact, bowl, steps)
     assert area(exact, found) == pytest.approx(area(exact, bowl), rel=0.02)
+
+
+def test_growth_adds_no_loop(exact, bowl):
+    """A ring at the mouth is taken, a hole in the bottom is not."""
+    template, values = cut_template(exact, bowl)
+    height = template.to_numpy()[0][:, 1]
+    ring, hole = (values > 0) & (height > -0.2), height < -0.5
+    assert ring.any() and hole.any()
+    for growth in (ring | hole, ring):
+        np.testing.assert_array_equal(_without_loops(exact, bowl, template, values, growth), ring)
+    assert not _without_loops(exact, bowl, template, values, hole).any()
 
 
 def test_what_is_closed_stays_so(fit, hull):
