@@ -1,4 +1,4 @@
-"""Losses that a fit leaves out: none was worth more than noise where it was measured."""
+"""Losses that a fit leaves out: on most scenes none is worth more than noise (docs/losses.md)."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def hollows(hull: np.ndarray, msdf: np.ndarray, opacity: np.ndarray, seen: np.nd
 
 
 def hollowed(surface: Surface, distance: np.ndarray) -> Surface:
-    """A surface without hollows.
+    """A surface with hollows carved out of its solid.
 
     Args:
         surface: with its hull.
