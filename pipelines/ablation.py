@@ -64,7 +64,7 @@ def page(scenes: list[Path], base: FitConfig, output: Path, options: str) -> str
         if any(outcome for *_, outcome in rows):
             text += f"## {scene.stem}\n\n{table(rows, 'what is left out')}\n"
         if rows[0][-1] and (stages := stages_table(rows[0][-1])):
-            text += f"After each stage of the fit with all of them, in its order:\n\n{stages}\n"
+            text += f"The surface after each stage of the fit with all of them, in its order:\n\n{stages}\n"
     return text.rstrip() + "\n"
 
 

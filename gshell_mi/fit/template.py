@@ -97,8 +97,12 @@ def template_of(subject: mi.Shape, surface: Surface, *, like: Template | None = 
 
 
 def preview_of(fit: Fit, surface: Surface) -> Preview:
-    """A surface between two stages, where stages have moved its template to, all in grey."""
+    """A surface between two stages, where stages have moved its template to, all in grey; nothing if nothing
+    was found yet."""
     subject = fit.scene.subject
+    if surface.hull is None and surface.seen is None:
+        nothing, none = np.zeros((0, 3)), np.zeros((0, 3), int)
+        return Preview(nothing, none, nothing, nothing, none)
     if surface.moved or surface.hull is not None:
         template = template_of(subject, surface)
         at, faces = surface.moved[0].positions if surface.moved else template.start, template.faces

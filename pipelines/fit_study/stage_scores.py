@@ -13,9 +13,6 @@ from gshell_mi.evaluation.mesh_scores import mesh_scores, read_mesh
 from gshell_mi.preview import Preview
 from gshell_mi.scene import FitScene
 
-#: Points on either surface: two samplings of one surface then differ by some 0.001 %.
-_POINTS = 100_000
-
 
 class StageScores:
     """An observer of a fit that scores the surface after each of its stages.
@@ -24,8 +21,7 @@ class StageScores:
         truth: mesh file to score against.
 
     Attributes:
-        scores: of the mesh, as ``mesh_scores`` gives them, by stage; those of the stage before, the same
-            object, where nothing has moved.
+        scores: of the mesh, as ``mesh_scores`` gives them, by stage; empty where there is none yet.
         cpu_seconds: that it has taken itself, on all threads.
     """
 
@@ -46,11 +42,13 @@ class StageScores:
         """Scores what a stage has left."""
         begin = time.process_time()
         shown = preview()
-        if self.scores and np.array_equal(shown.vertices, self._last):
+        if not len(shown.faces):
+            self.scores[stage] = {}
+        elif np.array_equal(shown.vertices, self._last):
             self.scores[stage] = list(self.scores.values())[-1]
-        elif len(shown.faces):
+        else:
             mesh = trimesh.Trimesh(shown.vertices, shown.faces, process=False)
-            self.scores[stage] = mesh_scores(mesh, self._truth, _POINTS)
+            self.scores[stage] = mesh_scores(mesh, self._truth)
         self._last = shown.vertices
         self.cpu_seconds += time.process_time() - begin
 

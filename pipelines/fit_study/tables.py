@@ -52,8 +52,10 @@ def stages_table(outcome: Outcome) -> str:
     lines = [f"| after | s | {' | '.join(titles)} |", "|---" * (len(titles) + 2) + "|"]
     before = None
     for stage, told in outcome.stages.items():
-        cells = ["same"] + [""] * (len(titles) - 1)
-        if told["mesh"] != before:
+        cells = [""] * len(titles)
+        if told["mesh"] == before:
+            cells[0] = "same"
+        elif told["mesh"]:
             cells = [_cell(name, told) for name in _OF_STAGES]
         lines.append(f"| *{stage}* | {told['seconds']:.0f} | {' | '.join(cells)} |")
         before = told["mesh"]

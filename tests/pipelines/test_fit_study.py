@@ -26,7 +26,7 @@ from command_reference import field_texts  # noqa: E402
 from fit_study import trials  # noqa: E402
 from fit_study.ablation_rows import ROWS  # noqa: E402
 from fit_study.settings import as_flags, non_default, parsed_settings  # noqa: E402
-from fit_study.tables import table  # noqa: E402
+from fit_study.tables import stages_table, table  # noqa: E402
 from fit_study.trials import Outcome, Trial, is_done, load_outcome, run_trial, run_trials  # noqa: E402
 
 #: The options of a fit that is over at once, whose openings do not matter, as NAME=VALUE.
@@ -47,7 +47,8 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def few_samples(monkeypatch):
-    monkeypatch.setattr("gshell_mi.compare.compare.mesh_scores", partial(mesh_scores, samples=1000))
+    for user in ("gshell_mi.compare.compare", "fit_study.stage_scores"):
+        monkeypatch.setattr(f"{user}.mesh_scores", partial(mesh_scores, samples=1000))
 
 
 def outcome(config=None, **changes):
@@ -146,6 +147,18 @@ def test_table():
     assert mixed[4].startswith("| second † |") and mixed[-1].startswith("† Fitted with another version")
 
 
+def test_table_of_stages():
+    moved = outcome().scores["mesh"]
+    stages = {"occlusion": {}, "hull": moved, "light": moved, "joint": moved | {"chamfer": 0.05}}
+    kept = {stage: {"seconds": 2.4, "mesh": mesh} for stage, mesh in stages.items()}
+    rows = [line.strip("| ").split(" | ") for line in stages_table(outcome(stages=kept)).splitlines()]
+    assert rows[0] == ["after", "s", "loops", "pin-holes", "components", "rim", "chamfer %", "F-score"]
+    assert rows[2][:2] == ["*occlusion*", "2"] and not "".join(rows[2][2:]).strip("| ")
+    assert rows[3][2:] == ["3 / 2", "3", "3 / 2", "0.50", "0.123", "0.988"]
+    assert rows[4][2] == "same" and rows[5][6] == "0.050"
+    assert stages_table(outcome()) == ""
+
+
 def test_only_the_same_settings_count(tmp_path):
     trial = Trial(Path("shirt.xml"), "default", FitConfig())
     assert load_outcome(trial, tmp_path) is None
@@ -182,6 +195,7 @@ def test_fits_scores_and_does_neither_twice(scene, tmp_path, capsys, monkeypatch
     assert "## bowl" in page and "| mask `--losses.mask 0` |" in page
     assert "`--resolution" not in page and "--iterations 2" in page, "shared settings are named"
     assert "`--poses keep`" not in page, "only what was measured"
+    assert "| *openings* |" in page and "| *joint* |" in page, "what the stages have left"
 
     monkeypatch.setattr(trials, "fit_scene", None)
     assert ablation.main(options) == 0
