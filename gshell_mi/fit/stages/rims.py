@@ -59,7 +59,7 @@ class Rims:
             if growth.any():
                 moved = opened_at(surface, template, values, given | growth)
                 denied = _denied(fit.outline_judge, closed.mesh, growth, fit.mesh(surface), fit.mesh(moved))
-                growth = _without_loops(fit, surface, template, values, growth & ~denied)
+                growth = _with_as_many_loops(fit, surface, template, values, growth & ~denied)
         steps.fact("rims_moved", bool(growth.any()))
         return opened_at(surface, template, values, given | growth) if growth.any() else surface
 
@@ -78,23 +78,23 @@ def _denied(judge: Judge, template: Mesh, growth: np.ndarray, before: Mesh, afte
     return verdict.reversed.accepted[place] & around
 
 
-def _without_loops(
+def _with_as_many_loops(
     fit: Fit, surface: Surface, template: SurfaceMesh, values: np.ndarray, growth: np.ndarray
 ) -> np.ndarray:
-    """(V,) growth (V,) of the openings of a template's (V,) values that adds no loop: part by part, the
-    largest first, what becomes a hole beside them is left out."""
+    """(V,) growth (V,) of the openings of a template's (V,) values that leaves as many loops: part by part, the
+    largest first, what becomes a hole beside them, or makes one of two, is left out."""
 
     def loops(opened: np.ndarray) -> int:
         return topology(*fit.mesh(opened_at(surface, template, values, opened))).boundary_loops
 
     kept = given = values <= 0
-    most = loops(given)
-    if loops(given | growth) <= most or not growth.any():
+    count = loops(given)
+    if not growth.any() or loops(given | growth) == count:
         return growth
     place = places_of(growth, lobes(growth, template.to_numpy()[1]))
     for part in np.argsort(-np.bincount(place[growth])):
         wider = kept | (place == part)
-        kept = wider if loops(wider) <= most else kept
+        kept = wider if loops(wider) == count else kept
     return kept & ~given
 
 

@@ -9,7 +9,7 @@ from cap import cap
 from silent_steps import Silent
 
 from gshell_mi.fit.stages.revision import cut_template
-from gshell_mi.fit.stages.rims import Rims, _without_loops, grown
+from gshell_mi.fit.stages.rims import Rims, _with_as_many_loops, grown
 from gshell_mi.topology import topology
 
 
@@ -52,8 +52,8 @@ def test_growth_adds_no_loop(exact, bowl):
     ring, hole = (values > 0) & (height > -0.2), height < -0.5
     assert ring.any() and hole.any()
     for growth in (ring | hole, ring):
-        np.testing.assert_array_equal(_without_loops(exact, bowl, template, values, growth), ring)
-    assert not _without_loops(exact, bowl, template, values, hole).any()
+        np.testing.assert_array_equal(_with_as_many_loops(exact, bowl, template, values, growth), ring)
+    assert not _with_as_many_loops(exact, bowl, template, values, hole).any()
 
 
 def test_what_is_closed_stays_so(fit, hull):
