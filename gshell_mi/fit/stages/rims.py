@@ -81,8 +81,8 @@ def _denied(judge: Judge, template: Mesh, growth: np.ndarray, before: Mesh, afte
 def _with_as_many_loops(
     fit: Fit, surface: Surface, template: SurfaceMesh, values: np.ndarray, growth: np.ndarray
 ) -> np.ndarray:
-    """(V,) growth (V,) of the openings of a template's (V,) values that leaves as many loops: part by part, the
-    largest first, what becomes a hole beside them, or makes one of two, is left out."""
+    """(V,) growth (V,) of the openings of a template's (V,) values that leaves as many loops: part by part,
+    the largest first, what becomes a hole beside them, or makes one of two, is left out."""
 
     def loops(opened: np.ndarray) -> int:
         return topology(*fit.mesh(opened_at(surface, template, values, opened))).boundary_loops
