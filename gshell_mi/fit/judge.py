@@ -123,6 +123,7 @@ class Judge:
         batch: pixels per batch of rays.
         seed: of the random pixels.
         off_outline: pixels as near to a mask's outline as this do not judge.
+        like: a judge of the same splits, whose pixels tell this one the colours, too.
     """
 
     def __init__(
@@ -134,9 +135,10 @@ class Judge:
         batch: int,
         seed: int = 0,
         off_outline: int = _OUTLINE,
+        like: Judge | None = None,
     ):
         self.views, self.targets, self.splits = views, targets, splits
-        self.batch, self.seed, self.off_outline = batch, seed, off_outline
+        self.batch, self.seed, self.off_outline, self._like = batch, seed, off_outline, like
 
     @staticmethod
     def halves(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -147,13 +149,15 @@ class Judge:
     @cached_property
     def _pools(self) -> list[tuple[PixelPool, PixelPool]]:
         """Pixels that tell the colours, and those that judge."""
+        told = (self._like or self)._telling
         return [
-            (
-                PixelPool(self.views, self.targets, known),
-                PixelPool(self.views, self.targets, unknown, self.off_outline),
-            )
-            for known, unknown in self.splits
+            (pool, PixelPool(self.views, self.targets, unknown, self.off_outline))
+            for pool, (_, unknown) in zip(told, self.splits, strict=True)
         ]
+
+    @cached_property
+    def _telling(self) -> list[PixelPool]:
+        return [PixelPool(self.views, self.targets, known) for known, _ in self.splits]
 
     def shown(self, mesh: Mesh, like: Shown | None = None) -> Shown:
         """A mesh as the images show it, once for each of the splits; it may mirror what another one does."""

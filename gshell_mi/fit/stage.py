@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -86,14 +86,14 @@ class Fit:
     def outline_judge(self) -> Judge:
         """Decides on changes of the surface that the joint stage leaves. It ends where masks do, to a pixel,
         so pixels beside outlines count: only they tell of a strip along a rim, as of leaf and lace."""
-        return self._judge(Judge.halves(len(self.views)), off_outline=0)
+        return self._judge(self.judge.splits, off_outline=0, like=self.judge)
 
     @cached_property
     def validation_judge(self) -> Judge:
         """Tells what the other views say of what was fitted to ``training``."""
         return self._judge([self._validation])
 
-    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]], **options: int) -> Judge:
+    def _judge(self, splits: list[tuple[np.ndarray, np.ndarray]], **options: Any) -> Judge:
         batch, seed = self.config.radiance.batch, self.config.seed
         return Judge(self.views, self.scene.targets, splits, batch=batch, seed=seed, **options)
 
