@@ -33,7 +33,7 @@ def _group(title: str, *rows: tuple[str, str, dict]) -> list[Row]:
 STAGES = _group(
     "Without one of the stages",
     ("default", "all stages", {}),
-    ("no-openings", "*openings*, and *revision*: where the hull is open in truth", {"watertight": True}),
+    ("no-openings", "*openings*, *revision*, *rims*: where the hull is open in truth", {"watertight": True}),
     ("no-cavities", "*cavities*: folds and hollows that the hull bridges", {"cavities.iterations": 0}),
     (
         "no-refinement",
@@ -57,7 +57,11 @@ STAGES = _group(
         "*revision*, and *rims*: openings judged again where the surface has moved",
         {"openings.revise": False},
     ),
-    ("no-detail", "*detail*: a finer lattice", {"detail.iterations": 0}),
+    (
+        "no-detail",
+        "*poses*, *revision*, *detail*, *rims*: all between *joint* and *smoothing*",
+        {"detail.iterations": 0},
+    ),
     ("no-smoothing", "*smoothing*: bumps that are noise", {"smoothing.most": 0.0}),
     ("no-texture", "*texture*: colours as fine as the images", {"texture.rounds": 0}),
 )
