@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -13,6 +14,8 @@ from gshell_mi.fields import LatticeFields, sphere
 from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.joint.joint import JointStage
+from gshell_mi.fit.lattices import Lattices
+from gshell_mi.fit.pipeline import pipeline
 from gshell_mi.fit.stage import Fit
 from gshell_mi.fit.stages.joint import (
     DetailConfig,
@@ -78,6 +81,19 @@ def test_it_starts_with_what_the_joint_stage_has_left(bowl_scene, resolution):
     np.testing.assert_array_equal(
         start_light(fit, left, CONFIG).log_radiance.numpy(), light.log_radiance.numpy()
     )
+
+
+def test_its_steps_are_not_those_of_the_joint_stage_again(bowl_scene):
+    config = CONFIG.changed({"iterations": 5, "detail.iterations": 4})
+    scene = load_fit_scene(bowl_scene)
+    joint, detail = (
+        stage
+        for stage in pipeline(scene, Lattices.of(scene.subject, config), config)
+        if stage.name in ("joint", "detail")
+    )
+    assert (joint.before, detail.before) == (0, 5)
+    first, second = (SimpleNamespace(_before=stage.before, config=config) for stage in (joint, detail))
+    assert JointStage.seed(second, 0) == JointStage.seed(first, 5)
 
 
 def test_its_rates_are_those_of_what_has_settled():

@@ -1,5 +1,6 @@
 """What the command says of mistakes: exit code 2, one sentence on stderr that names the culprit."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -17,8 +18,10 @@ from gshell_mi.fit import FitConfig
 from gshell_mi.fit.__main__ import main
 from gshell_mi.fit.bookkeeping.checkpoint import Checkpoint
 from gshell_mi.fit.flags import GONE, RENAMED
+from gshell_mi.fit.scene_checks import notes_on_views
 from gshell_mi.fit.stages.openings import Openings
 from gshell_mi.own_folder import OwnFolder
+from gshell_mi.scene import load_fit_scene
 
 
 @pytest.fixture
@@ -342,6 +345,13 @@ def test_smoothing_and_rates_of_0_switch_off(bowl_scene, tmp_path):
 @pytest.mark.parametrize("mode", ["--known-light", "--geometry-only"])
 def test_a_known_light_does_not_turn(told, mode):
     assert f"{mode} keeps the light where the scene has it" in told(mode, "--light-frame", "camera")
+
+
+def test_too_few_views_to_tell_anything_are_told_of(bowl_scene):
+    scene = load_fit_scene(bowl_scene)
+    assert notes_on_views(scene) == []
+    (note,) = notes_on_views(dataclasses.replace(scene, targets=scene.targets[:3]))
+    assert "fewer than 4 training views" in note and "give more views" in note
 
 
 def test_no_surface_left(told, scene, tmp_path):
